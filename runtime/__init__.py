@@ -1,0 +1,1 @@
+"""The service on the robot: configuration, ticker, modes, guard, link, recorder and daemon."""

@@ -1,0 +1,1 @@
+"""The body in PyBullet: the simulator that stands in for the hardware behind the same verbs."""

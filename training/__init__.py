@@ -1,0 +1,1 @@
+"""The desktop: the teacher, the trainer and the proof."""
