@@ -130,7 +130,6 @@ class Keys:
 
 def tick_schema() -> bytes:
     """``TICK_DTYPE`` as JSON: name, numpy type, shape and offset of every field, so that any language can read it."""
-    fields = TICK_DTYPE.fields or {}
     rows = [
         {
             "name": name,
@@ -138,6 +137,7 @@ def tick_schema() -> bytes:
             "shape": list(dtype.shape),
             "offset": offset,
         }
-        for name, (dtype, offset, *_) in fields.items()
+        for name in TICK_DTYPE.names or ()
+        for dtype, offset in [TICK_DTYPE.fields[name][:2]]  # type: ignore[index]
     ]
     return msgspec.json.encode({"itemsize": TICK_DTYPE.itemsize, "fields": rows})
