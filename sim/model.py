@@ -35,7 +35,7 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class Hinge:
-    """One revolute joint: child frame = parent frame moved by ``origin``, turned by ``rotation``, then about ``axis``."""
+    """One revolute joint: child frame = the parent's moved by ``origin``, turned by ``rotation`` and about ``axis``."""
 
     name: str
     parent: str
