@@ -50,7 +50,9 @@ def leg_geometry(description: RobotDescription) -> Records:
         ("thigh_moment", links.thigh, ones),
         ("shank_moment", links.shank, ones),
     ):
-        geometry[name][0] = link.mass * np.stack([along * link.com[0], mirror * link.com[1], ones * link.com[2]], axis=1)
+        geometry[name][0] = link.mass * np.stack(
+            [along * link.com[0], mirror * link.com[1], ones * link.com[2]], axis=1
+        )
     geometry["hips"] = description.hips
     geometry["side"] = SIDE
     for name in ("abduction_length", "thigh_length", "shank_length", "foot_radius"):

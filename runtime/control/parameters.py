@@ -42,6 +42,8 @@ class GainsConfig(Record, frozen=True, kw_only=True):
     """N·m·s/rad."""
     stance_scale: Fraction = 0.1
     """The paper's 0.1: share of the gains that a stance leg keeps."""
+    standing_scale: Fraction = 0.5
+    """Share of the gains while the robot stands on four feet."""
     max_joint_speed: Positive = 15.0
     """Bound on the differentiated joint targets, rad/s."""
 

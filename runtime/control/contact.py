@@ -1,0 +1,42 @@
+"""Foot force from joint torque, and contact from foot force. Method: Contact from torque."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from runtime.control.kinematics import gravity_of_leg
+
+SINGULAR = 1e-5
+"""A leg whose Jacobian has a smaller determinant (m³) tells no force."""
+
+
+@numba.njit(cache=True)
+def foot_force(g, leg, q, torque, up, jacobian, force):  # type: ignore[no-untyped-def]
+    """Ground on foot of one leg, body frame, N, written into ``force`` (3,): f = -J⁻ᵀ (torque - gravity).
+
+    ``up`` (3,) is the world's z axis in the body frame. Inertial forces of a swinging leg are not modelled.
+    """
+    gravity = np.empty(3)
+    gravity_of_leg(g, leg, q, up, gravity)
+    r0, r1, r2 = gravity[0] - torque[0], gravity[1] - torque[1], gravity[2] - torque[2]
+    determinant = 0.0
+    for i in range(3):
+        a, b = jacobian[(i + 1) % 3], jacobian[(i + 2) % 3]
+        # rows of J⁻ᵀ are cross products of the rows of J over the determinant
+        c0, c1, c2 = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        force[i] = c0 * r0 + c1 * r1 + c2 * r2
+        determinant = jacobian[i, 0] * c0 + jacobian[i, 1] * c1 + jacobian[i, 2] * c2
+    scale = 0.0 if abs(determinant) < SINGULAR else 1.0 / determinant
+    for i in range(3):
+        force[i] *= scale
+
+
+@numba.njit(cache=True)
+def feel_contacts(p, s, t):  # type: ignore[no-untyped-def]
+    """Contact of every foot from the vertical force, with hysteresis, blind early in a swing."""
+    for leg in range(4):
+        bound = p.contact_release if s.contacts[leg] else p.contact_threshold
+        blind = s.swinging[leg] and t.phase[leg] < p.contact_blanking
+        s.contacts[leg] = t.contact_force[leg, 2] > bound and not blind
+        t.contacts[leg] = s.contacts[leg]

@@ -1,0 +1,201 @@
+"""Attitude, velocity, feet and height of the body from one measurement: a linear Kalman filter.
+
+State: velocity of the body origin and the four feet relative to it, all in world axes; so nothing unobservable is
+carried. Input: the accelerometer. Measurements: for every foot in contact, where it is and how fast the body must move
+for it to stay (leg odometry). Noise is isotropic and the axes do not mix, so the 15-state filter is three filters of
+five states with one shared covariance, updated by scalars: exact, and a microsecond.
+After Bloesch et al., "State Estimation for Legged Robots", with attitude taken from the inertial unit.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from runtime.control.contact import feel_contacts, foot_force
+from runtime.control.kinematics import GRAVITY, foot_of_leg, jacobian_of_leg
+
+
+@numba.njit(cache=True)
+def rotation_from(q, rotation):  # type: ignore[no-untyped-def]
+    """Rotation body to world (3, 3) of the quaternion w x y z, normalised."""
+    scale = 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    rotation[0, 0] = 1.0 - scale * (y * y + z * z)
+    rotation[0, 1] = scale * (x * y - w * z)
+    rotation[0, 2] = scale * (x * z + w * y)
+    rotation[1, 0] = scale * (x * y + w * z)
+    rotation[1, 1] = 1.0 - scale * (x * x + z * z)
+    rotation[1, 2] = scale * (y * z - w * x)
+    rotation[2, 0] = scale * (x * z - w * y)
+    rotation[2, 1] = scale * (y * z + w * x)
+    rotation[2, 2] = 1.0 - scale * (x * x + y * y)
+
+
+@numba.njit(cache=True)
+def times(rotation, vector, out):  # type: ignore[no-untyped-def]
+    """Write rotation (3, 3) times vector (3,) into ``out`` (3,)."""
+    for i in range(3):
+        out[i] = rotation[i, 0] * vector[0] + rotation[i, 1] * vector[1] + rotation[i, 2] * vector[2]
+
+
+@numba.njit(cache=True)
+def transposed_times(rotation, vector, out):  # type: ignore[no-untyped-def]
+    """Write rotation transposed times vector (3,) into ``out`` (3,)."""
+    for i in range(3):
+        out[i] = rotation[0, i] * vector[0] + rotation[1, i] * vector[1] + rotation[2, i] * vector[2]
+
+
+@numba.njit(cache=True)
+def estimate(p, g, s, t, rotation, imu, joints, jacobian):  # type: ignore[no-untyped-def]
+    """One tick of contact, filter and height: fills the estimate's fields of the tick record ``t``.
+
+    Args:
+        p, g, s, t: parameters, geometry, state and tick records.
+        rotation: (3, 3) body to heading frame, written here.
+        imu: (10,) quaternion, angular velocity, linear acceleration.
+        joints: (3, 4, 3) position, velocity, torque.
+        jacobian: (4, 3, 3) body frame, written here.
+    """
+    to_world = np.empty((3, 3))
+    rotation_from(imu[:4], to_world)
+    yaw = math.atan2(to_world[1, 0], to_world[0, 0])
+    t.rpy[0] = math.atan2(to_world[2, 1], to_world[2, 2])
+    t.rpy[1] = -math.asin(min(1.0, max(-1.0, to_world[2, 0])))
+    t.rpy[2] = yaw
+    c, sn = math.cos(yaw), math.sin(yaw)
+    for i in range(3):
+        rotation[0, i] = c * to_world[0, i] + sn * to_world[1, i]
+        rotation[1, i] = -sn * to_world[0, i] + c * to_world[1, i]
+        rotation[2, i] = to_world[2, i]
+    foot, force = np.empty(3), np.empty(3)
+    in_world = np.empty((4, 3))
+    odometry = np.empty((4, 3))
+    rolling = np.empty((4, 3))
+    for leg in range(4):
+        q = joints[0, leg]
+        foot_of_leg(g, leg, q, foot)
+        jacobian_of_leg(g, leg, q, jacobian[leg])
+        times(rotation, foot, t.feet[leg])
+        times(to_world, foot, in_world[leg])
+        foot_force(g, leg, q, joints[2, leg], to_world[2], jacobian[leg], force)
+        times(rotation, force, t.contact_force[leg])
+        _leg_odometry(g, q, joints[1, leg], imu[4:7], foot, jacobian[leg], to_world, odometry[leg], rolling[leg])
+    feel_contacts(p, s, t)
+    if not s.started:
+        _start(p, s, in_world)
+    _predict(p, s, to_world, imu[7:10], rolling)
+    for leg in range(4):
+        _update(p, s, leg, in_world[leg], odometry[leg])
+    _height(p, g, s, t)
+    t.twist[0] = c * s.velocity[0] + sn * s.velocity[1]
+    t.twist[1] = -sn * s.velocity[0] + c * s.velocity[1]
+    t.twist[2] = s.velocity[2]
+    times(rotation, imu[4:7], t.twist[3:6])
+    for i in range(3):
+        s.position[i] += s.velocity[i] * p.dt
+        t.position[i] = s.position[i]
+
+
+@numba.njit(cache=True)
+def _leg_odometry(g, q, speed, rate, foot, jacobian, to_world, velocity, rolling):  # type: ignore[no-untyped-def]
+    """Velocity (3,) that the body has if this foot rolls without slipping, and of the rolling foot's centre, world.
+
+    A sphere's centre moves while its shank turns above the ground: 5 % of the walking speed.
+    """
+    relative, turning, scratch = np.empty(3), np.empty(3), np.empty(3)
+    times(jacobian, speed, relative)
+    relative[0] += rate[1] * foot[2] - rate[2] * foot[1]
+    relative[1] += rate[2] * foot[0] - rate[0] * foot[2]
+    relative[2] += rate[0] * foot[1] - rate[1] * foot[0]
+    bend = speed[1] + speed[2]
+    scratch[0] = rate[0] + speed[0]
+    scratch[1] = rate[1] + bend * math.cos(q[0])
+    scratch[2] = rate[2] + bend * math.sin(q[0])
+    times(to_world, scratch, turning)
+    rolling[0] = turning[1] * g.foot_radius
+    rolling[1] = -turning[0] * g.foot_radius
+    rolling[2] = 0.0
+    times(to_world, relative, velocity)
+    for i in range(3):
+        velocity[i] = rolling[i] - velocity[i]
+
+
+@numba.njit(cache=True)
+def _start(p, s, in_world):  # type: ignore[no-untyped-def]
+    s.velocity[:] = 0.0
+    s.support[:] = in_world
+    s.covariance[:] = 0.0
+    s.covariance[0, 0] = 0.1
+    for leg in range(4):
+        s.covariance[leg + 1, leg + 1] = p.foot_position_noise**2
+    s.height = p.walking_height
+    s.started = 2
+
+
+@numba.njit(cache=True)
+def _predict(p, s, to_world, acceleration, rolling):  # type: ignore[no-untyped-def]
+    covariance = s.covariance
+    gained = np.empty(3)
+    times(to_world, acceleration, gained)
+    gained[2] -= GRAVITY
+    for i in range(3):
+        for leg in range(4):
+            s.support[leg, i] += p.dt * (rolling[leg, i] - s.velocity[i])
+        s.velocity[i] += p.dt * gained[i]
+    for leg in range(1, 5):
+        for i in range(5):
+            covariance[leg, i] -= p.dt * covariance[0, i]
+    for leg in range(1, 5):
+        for i in range(5):
+            covariance[i, leg] -= p.dt * covariance[i, 0]
+        covariance[leg, leg] += p.slip_noise**2 * p.dt
+    covariance[0, 0] += (p.acceleration_noise * p.dt) ** 2
+
+
+@numba.njit(cache=True)
+def _update(p, s, leg, foot, velocity):  # type: ignore[no-untyped-def]
+    """Two scalar updates for a foot in contact; a foot in the air is only where kinematics says."""
+    covariance = s.covariance
+    row = leg + 1
+    if not s.contacts[leg]:
+        s.support[leg] = foot
+        covariance[row, :] = 0.0
+        covariance[:, row] = 0.0
+        covariance[row, row] = p.foot_position_noise**2
+        return
+    gain = np.empty(5)
+    for state, noise, measured in ((row, p.foot_position_noise, foot), (0, p.foot_velocity_noise, velocity)):
+        scale = 1.0 / (covariance[state, state] + noise * noise)
+        for i in range(5):
+            gain[i] = covariance[i, state] * scale
+        for axis in range(3):
+            known = s.velocity[axis] if state == 0 else s.support[leg, axis]
+            innovation = measured[axis] - known
+            s.velocity[axis] += gain[0] * innovation
+            for i in range(4):
+                s.support[i, axis] += gain[i + 1] * innovation
+        across = covariance[state].copy()
+        for i in range(5):
+            for k in range(5):
+                covariance[i, k] -= gain[i] * across[k]
+
+
+@numba.njit(cache=True)
+def _height(p, g, s, t):  # type: ignore[no-untyped-def]
+    """Low-passed height above the feet in contact; without any, the velocity carries it on."""
+    total, count = 0.0, 0
+    for leg in range(4):
+        if s.contacts[leg]:
+            total += g.foot_radius - s.support[leg, 2]
+            count += 1
+    s.height += s.velocity[2] * p.dt
+    if count > 0:
+        measured = total / count
+        if s.started == 2:
+            s.height = measured
+            s.started = 1
+        s.height += (measured - s.height) * p.dt / (p.dt + p.height_time_constant)
+    t.height = s.height

@@ -1,0 +1,63 @@
+"""The phase clock: which legs should swing, how far their swing is, and early and late contact."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from drivers.robot import Array
+from runtime.control.parameters import GaitConfig
+
+GAITS: dict[str, tuple[tuple[float, float, float, float], float | None]] = {
+    # when FL FR BL BR begin their swing, as a share of the cycle, and the duty factor (None: from the config's times)
+    "trot": ((0.0, 0.5, 0.5, 0.0), None),
+    "walk": ((0.25, 0.75, 0.0, 0.5), 0.75),
+    "pace": ((0.0, 0.5, 0.0, 0.5), None),
+    "bound": ((0.0, 0.0, 0.5, 0.5), None),
+    "pronk": ((0.0, 0.0, 0.0, 0.0), None),
+    "stand": ((0.0, 0.0, 0.0, 0.0), 1.0),
+}
+
+
+def gait_table(gait: GaitConfig) -> tuple[Array, float, float]:
+    """Phase offsets (4,) of a gait, its swing time and its stance time, s."""
+    begins, duty = GAITS[gait.name]
+    stance_time = gait.stance_time
+    if duty is not None and duty < 1.0:
+        stance_time = gait.swing_time * duty / (1.0 - duty)
+    return (1.0 - np.array(begins)) % 1.0, gait.swing_time, stance_time
+
+
+@numba.njit(cache=True)
+def advance_gait(p, s, t, standing):  # type: ignore[no-untyped-def]
+    """Move the clock by one tick and decide swing and stance of every leg.
+
+    A leg swings through its window; after mid-swing a felt contact ends the swing early; a leg that found no ground at
+    its window's end searches and is not loaded. While ``standing`` no new swing begins, and once all legs stand the
+    clock waits at the cycle's start.
+    """
+    before = s.clock
+    s.clock = (before + p.dt / p.cycle_time) % 1.0
+    for leg in range(4):
+        share = (s.clock + p.gait_offset[leg]) % 1.0
+        begun = share < (before + p.gait_offset[leg]) % 1.0
+        in_window = share < p.swing_fraction
+        t.phase[leg] = math.pi
+        if s.swinging[leg]:
+            if in_window:
+                t.phase[leg] = math.pi * share / p.swing_fraction
+            touched = p.early_contact and s.contacts[leg] and t.phase[leg] > 0.5 * math.pi
+            if touched or not in_window:
+                s.swinging[leg] = 0
+                s.searching[leg] = not s.contacts[leg]
+        elif in_window and begun and not standing:
+            s.swinging[leg] = 1
+            s.searching[leg] = 0
+            t.phase[leg] = math.pi * share / p.swing_fraction
+        elif s.contacts[leg]:
+            s.searching[leg] = 0
+        t.stance[leg] = not (s.swinging[leg] or s.searching[leg])
+    if standing and not s.swinging.any():
+        s.clock = 1.0 - 1e-9

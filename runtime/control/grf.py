@@ -1,0 +1,173 @@
+"""Wrench distribution: the quadratic programme of Eq. 3-4, built, checked and its fallback. Method: Wrench distribution.
+
+Only stance legs are variables, so the problem has 3, 6, 9 or 12 of them::
+
+    min ½ fᵀ Q f + cᵀ f,   Q = 2 (Aᵀ H A + P),  c = -2 Aᵀ H b
+    |f_x|, |f_y| ≤ μ f_z,  f_min ≤ f_z ≤ f_max  for every stance leg
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from drivers.robot import Array
+from runtime.control.kinematics import GRAVITY
+from runtime.control.records import Clamp
+
+_FRICTION = int(Clamp.FRICTION)
+PYRAMID_ROWS = 4
+"""Inequality rows a leg: ±f_x - μ f_z ≤ 0, ±f_y - μ f_z ≤ 0."""
+GAP_TOLERANCE = 1e-8
+"""Accepted sub-optimality (objective, N²): with P = 1e-3 it bounds the error of the forces by 3 mN."""
+FEASIBILITY_TOLERANCE = 1e-6
+"""Accepted violation of a bound or of the pyramid, N."""
+
+
+class GrfProblem(NamedTuple):
+    """One tick's programme over the forces of the n stance legs; arrays are views, valid until the next tick."""
+
+    hessian: Array
+    """Q. Shape (3n, 3n)."""
+    gradient: Array
+    """c. Shape (3n,)."""
+    friction: float
+    min_force: float
+    max_force: float
+
+
+def pyramid(legs: int, friction: float) -> Array:
+    """Rows G of the friction pyramid, G f ≤ 0. Shape (4 legs, 3 legs)."""
+    leg = np.array([[1.0, 0.0, -friction], [-1.0, 0.0, -friction], [0.0, 1.0, -friction], [0.0, -1.0, -friction]])
+    return np.kron(np.eye(legs), leg)
+
+
+def force_bounds(legs: int, friction: float, min_force: float, max_force: float) -> tuple[Array, Array]:
+    """Lower and upper bound of every force component, N; those of x and y follow from the pyramid. Shape (3 legs,)."""
+    side = friction * max_force
+    return np.tile([-side, -side, min_force], legs), np.tile([side, side, max_force], legs)
+
+
+@numba.njit(cache=True)
+def aim_wrench(p, policy, t):  # type: ignore[no-untyped-def]
+    """Fill ``target_wrench`` (6,): gravity's, the policy's and the centripetal force of the commanded arc."""
+    t.target_wrench[:] = t.action[12:]
+    t.target_wrench[2] += p.mass * GRAVITY
+    turn = policy.centripetal * p.mass * t.velocity_command[2]
+    t.target_wrench[0] -= turn * t.velocity_command[1]
+    t.target_wrench[1] += turn * t.velocity_command[0]
+
+
+@numba.njit(cache=True)
+def build_qp(p, t, com, buffer, gradient):  # type: ignore[no-untyped-def]
+    """Write Q and c of this tick's stance legs; ``com`` (3,) is the centre of mass in the heading frame.
+
+    Q lies row by row at the start of ``buffer`` (144,), c at the start of ``gradient`` (12,). Returns the number of stance legs, or -1 where a number is not finite.
+    """
+    h = p.wrench_weight
+    b = t.target_wrench
+    arms = np.empty((4, 3))
+    legs = 0
+    finite = np.isfinite(b).all()
+    for leg in range(4):
+        if t.stance[leg]:
+            for i in range(3):
+                arms[legs, i] = t.feet[leg, i] - com[i]
+                finite = finite and np.isfinite(arms[legs, i])
+            legs += 1
+    hessian = buffer[: 9 * legs * legs].reshape(3 * legs, 3 * legs)
+    for i in range(legs):
+        rx, ry, rz = arms[i, 0], arms[i, 1], arms[i, 2]
+        gradient[3 * i] = -2.0 * (h[0] * b[0] + h[4] * rz * b[4] - h[5] * ry * b[5])
+        gradient[3 * i + 1] = -2.0 * (h[1] * b[1] - h[3] * rz * b[3] + h[5] * rx * b[5])
+        gradient[3 * i + 2] = -2.0 * (h[2] * b[2] + h[3] * ry * b[3] - h[4] * rx * b[4])
+        for k in range(i, legs):
+            sx, sy, sz = arms[k, 0], arms[k, 1], arms[k, 2]
+            block = hessian[3 * i : 3 * i + 3, 3 * k : 3 * k + 3]
+            block[0, 0] = 2.0 * (h[0] + h[4] * rz * sz + h[5] * ry * sy)
+            block[0, 1] = -2.0 * h[5] * ry * sx
+            block[0, 2] = -2.0 * h[4] * rz * sx
+            block[1, 0] = -2.0 * h[5] * rx * sy
+            block[1, 1] = 2.0 * (h[1] + h[3] * rz * sz + h[5] * rx * sx)
+            block[1, 2] = -2.0 * h[3] * rz * sy
+            block[2, 0] = -2.0 * h[4] * rx * sz
+            block[2, 1] = -2.0 * h[3] * ry * sz
+            block[2, 2] = 2.0 * (h[2] + h[3] * ry * sy + h[4] * rx * sx)
+            if k > i:
+                hessian[3 * k : 3 * k + 3, 3 * i : 3 * i + 3] = block.T
+        for j in range(3):
+            hessian[3 * i + j, 3 * i + j] += 2.0 * p.force_weight
+    return legs if finite else -1
+
+
+@numba.njit(cache=True)
+def accept(hessian, gradient, friction, min_force, max_force, force):  # type: ignore[no-untyped-def]
+    """Whether ``force`` (3n,) is finite, feasible and optimal within tolerance, whatever its solver says.
+
+    The feasible set is a truncated pyramid for each leg, so the Frank-Wolfe gap Σ ∇·f - min ∇·v over the corners v is
+    one pass; it bounds how far the objective is above its minimum, and so the error of the forces.
+    """
+    n = len(force)
+    gap = 0.0
+    for leg in range(n // 3):
+        fx, fy, fz = force[3 * leg], force[3 * leg + 1], force[3 * leg + 2]
+        if not np.isfinite(fx + fy + fz):
+            return False
+        slack = friction * fz + FEASIBILITY_TOLERANCE
+        if abs(fx) > slack or abs(fy) > slack:
+            return False
+        if fz < min_force - FEASIBILITY_TOLERANCE or fz > max_force + FEASIBILITY_TOLERANCE:
+            return False
+        gx, gy, gz = gradient[3 * leg], gradient[3 * leg + 1], gradient[3 * leg + 2]
+        for k in range(n):
+            gx += hessian[3 * leg, k] * force[k]
+            gy += hessian[3 * leg + 1, k] * force[k]
+            gz += hessian[3 * leg + 2, k] * force[k]
+        slope = gz - friction * (abs(gx) + abs(gy))
+        gap += gx * fx + gy * fy + gz * fz - min(slope * min_force, slope * max_force)
+    return gap <= GAP_TOLERANCE * max(1.0, abs(gradient[2]))
+
+
+@numba.njit(cache=True)
+def clipped_least_squares(hessian, gradient, friction, min_force, max_force):  # type: ignore[no-untyped-def]
+    """The third resort: the unconstrained minimum (3n,), each leg clipped into its truncated pyramid."""
+    force = np.linalg.solve(hessian, -gradient)
+    for leg in range(len(force) // 3):
+        fz = min(max_force, max(min_force, force[3 * leg + 2]))
+        side = friction * fz
+        force[3 * leg + 2] = fz
+        for i in range(2):
+            force[3 * leg + i] = min(side, max(-side, force[3 * leg + i]))
+    return force
+
+
+@numba.njit(cache=True)
+def share_forces(p, t, force):  # type: ignore[no-untyped-def]
+    """Put the solved forces (3n,) on the stance legs and zero on the others; note a force at its bound."""
+    index = 0
+    for leg in range(4):
+        t.grf[leg] = 0.0
+        if t.stance[leg]:
+            t.grf[leg] = force[3 * index : 3 * index + 3]
+            fz = t.grf[leg, 2]
+            edge = p.friction * fz - 1e-6
+            if abs(t.grf[leg, 0]) >= edge or abs(t.grf[leg, 1]) >= edge or fz >= p.max_force - 1e-6:
+                t.clamps |= _FRICTION
+            index += 1
+
+
+@numba.njit(cache=True)
+def cut_forces(p, t):  # type: ignore[no-untyped-def]
+    """The direct variant: forces of the policy plus an equal share of gravity, cut into each leg's pyramid."""
+    legs = max(1, t.stance.sum())
+    for leg in range(4):
+        if not t.stance[leg]:
+            t.grf[leg] = 0.0
+            continue
+        wanted = t.grf[leg, 2] + p.mass * GRAVITY / legs
+        t.grf[leg, 2] = min(p.max_force, max(p.min_force, wanted))
+        side = p.friction * t.grf[leg, 2]
+        for i in range(2):
+            t.grf[leg, i] = min(side, max(-side, t.grf[leg, i]))

@@ -1,0 +1,173 @@
+"""The core's memory: what it remembers between ticks and what it was told at the start, each one numpy record.
+
+Plain records instead of objects make a step one call into compiled code, a reset one assignment and a bit-exact replay
+a matter of copying bytes. Every field names the room that owns it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.description import SIDE, RobotDescription, composite_inertia
+from runtime.control.gait import GAITS, gait_table
+from runtime.control.kinematics import inverse, leg_geometry
+from runtime.control.parameters import ControlConfig
+from runtime.control.records import Records
+
+HIDDEN = 32
+"""Largest hidden layer of the small fully-connected policy."""
+
+STATE_DTYPE = np.dtype(
+    [
+        # contact
+        ("contacts", "u1", (4,)),
+        # estimator
+        ("started", "u1"),
+        ("velocity", "f8", (3,)),  # of the body origin in the world, m/s
+        ("support", "f8", (4, 3)),  # feet from the body origin, world axes, m
+        ("covariance", "f8", (5, 5)),  # of velocity and four feet, the same for x, y and z
+        ("height", "f8"),
+        ("position", "f8", (3,)),
+        # command
+        ("followed", "f8", (3,)),  # velocity command after its acceleration bound
+        ("integral", "f8", (2,)),  # m/s added to the command
+        ("walked", "f8"),  # s since the controller was reset or stood
+        ("heading", "f8"),  # rad, where the commanded turn has led
+        # observation, policy
+        ("previous", "f8", (14,)),
+        ("remembered", "u1"),
+        ("shifts", "f8", (4, 3)),
+        # gait
+        ("clock", "f8"),  # share of the cycle
+        ("swinging", "u1", (4,)),
+        ("searching", "u1", (4,)),
+        ("stance", "u1", (4,)),
+        # trajectory
+        ("foot_targets", "f8", (4, 3)),
+        ("depth", "f8", (4,)),  # how far a searching leg has gone down, m
+        # torque
+        ("joint_targets", "f8", (4, 3)),
+        ("gain_scale", "f8", (4,)),
+        ("commanded", "u1"),
+    ],
+    align=True,
+)
+
+PARAMETERS_DTYPE = np.dtype(
+    [
+        ("dt", "f8"),
+        ("mass", "f8"),
+        ("com", "f8", (3,)),  # of the whole robot in its stand pose, from the body origin, body frame, m
+        ("nominal_footholds", "f8", (4, 2)),
+        # gait
+        ("gait_offset", "f8", (4,)),
+        ("swing_fraction", "f8"),
+        ("cycle_time", "f8"),
+        ("swing_time", "f8"),
+        ("stance_time", "f8"),
+        ("swing_height", "f8"),
+        ("walking_height", "f8"),
+        ("early_contact", "u1"),
+        ("search_speed", "f8"),
+        ("search_depth", "f8"),
+        # torque
+        ("kp", "f8", (3,)),
+        ("kd", "f8", (3,)),
+        ("stance_scale", "f8"),
+        ("standing_scale", "f8"),
+        ("max_joint_speed", "f8"),
+        # contact
+        ("contact_threshold", "f8"),
+        ("contact_release", "f8"),
+        ("contact_blanking", "f8"),
+        # estimator
+        ("acceleration_noise", "f8"),
+        ("foot_position_noise", "f8"),
+        ("foot_velocity_noise", "f8"),
+        ("slip_noise", "f8"),
+        ("height_time_constant", "f8"),
+        # grf
+        ("friction", "f8"),
+        ("min_force", "f8"),
+        ("max_force", "f8"),
+        ("wrench_weight", "f8", (6,)),
+        ("force_weight", "f8"),
+        # bounds
+        ("shift_bound", "f8"),
+        ("wrench_bound", "f8", (6,)),
+        ("velocity_bound", "f8", (3,)),
+        ("acceleration_bound", "f8", (3,)),
+    ],
+    align=True,
+)
+
+POLICY_DTYPE = np.dtype(
+    [
+        ("relative", "u1"),  # observation relative to the command
+        ("direct", "u1"),  # outputs ground reaction forces instead of a wrench
+        ("hidden_size", "i8"),  # 0: linear
+        ("observation_scale", "f8", (28,)),
+        ("action_scale", "f8", (24,)),
+        ("action_bound", "f8", (24,)),
+        ("shift_time_constant", "f8"),
+        ("velocity_integral", "f8"),
+        ("integral_bound", "f8"),
+        ("integral_freeze", "f8"),
+        ("integral_delay", "f8"),
+        ("capture_point", "f8"),
+        ("velocity_error_bound", "f8"),
+        ("centripetal", "f8"),
+        ("matrix", "f8", (24, 28)),
+        ("hidden", "f8", (HIDDEN, 28)),
+        ("readout", "f8", (24, HIDDEN)),
+    ],
+    align=True,
+)
+
+
+def stand_angles(description: RobotDescription, walking_height: float) -> np.ndarray:
+    """Joint angles (4, 3) with the feet below the ends of the abduction links, body level at ``walking_height``."""
+    feet = description.hips.copy()
+    feet[:, 1] += SIDE * description.abduction_length
+    feet[:, 2] = description.foot_radius - walking_height
+    angles, _ = inverse(leg_geometry(description), feet)
+    return angles
+
+
+def build_parameters(description: RobotDescription, config: ControlConfig) -> Records:
+    """A robot's constants as the compiled core reads them. Shape (1,) of ``PARAMETERS_DTYPE``."""
+    parameters = np.zeros(1, PARAMETERS_DTYPE)
+    p = parameters[0]
+    com, _ = composite_inertia(description, stand_angles(description, config.gait.walking_height))
+    p["dt"], p["mass"], p["com"] = 1.0 / config.rate_hz, description.mass, com
+    p["nominal_footholds"] = description.hips[:, :2]
+    p["nominal_footholds"][:, 0] += com[0]
+    p["nominal_footholds"][:, 1] += SIDE * description.abduction_length
+    set_gait(parameters, config)
+    gains, grf, bounds, contact = config.gains, config.grf, config.bounds, config.contact
+    p["kp"], p["kd"] = gains.kp, gains.kd
+    for name in ("stance_scale", "standing_scale", "max_joint_speed"):
+        p[name] = getattr(gains, name)
+    p["contact_threshold"], p["contact_release"] = contact.threshold, contact.release * contact.threshold
+    p["contact_blanking"] = contact.blanking * np.pi
+    for name in config.estimator.__struct_fields__:
+        p[name] = getattr(config.estimator, name)
+    for name in ("friction", "min_force", "max_force", "wrench_weight", "force_weight"):
+        p[name] = getattr(grf, name)
+    p["shift_bound"] = bounds.shift
+    p["wrench_bound"] = (*bounds.force, *bounds.moment)
+    p["velocity_bound"] = (*bounds.linear_velocity, bounds.yaw_rate)
+    p["acceleration_bound"] = (bounds.linear_acceleration, bounds.linear_acceleration, bounds.yaw_acceleration)
+    return parameters
+
+
+def set_gait(parameters: Records, config: ControlConfig) -> None:
+    """Write the gait's table and timing into ``parameters``."""
+    p, gait = parameters[0], config.gait
+    assert gait.name in GAITS
+    offsets, swing_time, stance_time = gait_table(gait)
+    p["gait_offset"], p["swing_time"], p["stance_time"] = offsets, swing_time, stance_time
+    p["cycle_time"] = swing_time + stance_time
+    p["swing_fraction"] = 0.0 if gait.name == "stand" else swing_time / (swing_time + stance_time)
+    for name in ("swing_height", "walking_height", "early_contact", "search_speed", "search_depth"):
+        p[name] = getattr(gait, name)
