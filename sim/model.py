@@ -207,17 +207,19 @@ def _mirrored(name: str, link: Link, mirror: Array) -> Body:
 
 
 def _with_rotor(inertia: Array, axis: Array | None, rotor: float) -> Array:
-    """Link inertia plus the rotor's about the joint axis, with as little across as keeps it a body's.
+    """Link inertia plus the rotor's about the joint axis, made a real body's again.
 
-    PyBullet knows no rotor, and sets an inertia that breaks the triangle inequality to zero.
+    PyBullet knows no rotor, and sets an inertia whose largest principal moment passes the sum of the others to zero:
+    what is missing is spread over those others. Some published URDFs need that without any rotor.
     """
-    if axis is None or rotor == 0.0:
-        return inertia
-    along = np.outer(axis, axis)
-    total = inertia + rotor * along
-    moment = float(axis @ total @ axis)
-    missing = max(0.0, 2 * moment - float(np.trace(total)))
-    return total + 0.505 * missing * (np.eye(3) - along)
+    total = inertia if axis is None else inertia + rotor * np.outer(axis, axis)
+    moments, axes = np.linalg.eigh(total)
+    missing = moments[2] - moments[0] - moments[1]
+    if missing <= 0.0:
+        return total
+    spread = np.array([0.505, 0.505, 0.0]) * missing
+    real: Array = total + axes @ np.diag(spread) @ axes.T
+    return real
 
 
 def _link_element(robot: ElementTree.Element, body: Body, inertia: Array) -> ElementTree.Element:

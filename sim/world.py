@@ -28,6 +28,7 @@ from sim.model import Model, build_model, rpy_rotation, standing_pose
 from sim.scenario import Push, Scenario
 from sim.sensors import Sensors
 from sim.terrain import HeightField, Plane, Slope, Steps, Terrain
+from sim.urdf import read_model
 
 GRAVITY = 9.81
 """m/s²."""
@@ -101,7 +102,8 @@ class World:
         Raises:
             SimulatorMissing: PyBullet cannot be imported.
             SimulatorError: PyBullet changed an inertia.
-            ValueError: the URDF does not fit the description, or the legs do not reach the walking height.
+            UrdfError: the URDF does not fit the description.
+            ValueError: the legs do not reach the walking height.
         """
         self._bullet = _import_bullet()
         self.description = description
@@ -111,7 +113,7 @@ class World:
         """Physics steps a tick."""
         self._dt = self.period / self.substeps
         self._stand = standing_pose(description, walking_height)
-        self._model = build_model(description)
+        self._model = build_model(description) if description.urdf is None else read_model(description, urdf_search)
         self._sensors = Sensors(description.joints)
         self._client = -1
         with _silenced():
