@@ -13,6 +13,16 @@ import msgspec
 
 from drivers.description import Record, RobotDescription
 from runtime.control.parameters import ControlConfig
+from runtime.parameters import (
+    CommandConfig,
+    DampConfig,
+    LimitsConfig,
+    LinkConfig,
+    PostureConfig,
+    RealtimeConfig,
+    RecorderConfig,
+    TourConfig,
+)
 
 ROBOTS = Path(__file__).parent / "robots"
 
@@ -26,6 +36,14 @@ class Config(Record, frozen=True, kw_only=True):
 
     robot: RobotDescription
     control: ControlConfig
+    limits: LimitsConfig = LimitsConfig()
+    posture: PostureConfig = PostureConfig()
+    command: CommandConfig = CommandConfig()
+    damp: DampConfig = DampConfig()
+    link: LinkConfig = LinkConfig()
+    recorder: RecorderConfig = RecorderConfig()
+    realtime: RealtimeConfig = RealtimeConfig()
+    tour: TourConfig = TourConfig()
 
 
 def find_robot(name: str) -> Path:
@@ -68,9 +86,44 @@ def parse(table: dict[str, Any], place: str) -> Config:
         if not math.isfinite(value):
             raise ConfigError(f"{place}: {key} = {value}: must be finite")
     try:
-        return msgspec.convert(table, Config)
+        config = msgspec.convert(table, Config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{place}: {_explain(str(error), table)}") from error
+    for problem in _contradictions(config):
+        raise ConfigError(f"{place}: {problem}")
+    return config
+
+
+def _contradictions(config: Config) -> Iterator[str]:
+    """Pairs of numbers that are each in their bounds but cannot both be true."""
+    joints, grf, limits = config.robot.joints, config.control.grf, config.limits
+    for leg, (lower, upper) in enumerate(zip(joints.lower, joints.upper, strict=True)):
+        for joint in range(3):
+            if lower[joint] >= upper[joint]:
+                place = f"[{leg}][{joint}]"
+                yield f"robot.joints.lower{place} = {lower[joint]}: must be below upper{place} = {upper[joint]}"
+    standing = config.control.gait.walking_height - config.robot.foot_radius + config.robot.hip_position[2]
+    if not 0 < standing < config.robot.reach:
+        height = config.control.gait.walking_height
+        yield f"control.gait.walking_height = {height}: the leg reaches {config.robot.reach:.3f} m"
+    if grf.min_force >= grf.max_force:
+        yield f"control.grf.min_force = {grf.min_force}: must be below max_force = {grf.max_force}"
+    if limits.arming_tilt > limits.max_tilt:
+        yield f"limits.arming_tilt = {limits.arming_tilt}: must not pass max_tilt = {limits.max_tilt}"
+    if limits.arming_temperature > limits.max_temperature:
+        yield (
+            f"limits.arming_temperature = {limits.arming_temperature}:"
+            f" must not pass max_temperature = {limits.max_temperature}"
+        )
+    if not config.link.allow_unprotected:
+        for endpoint in config.link.listen:
+            if not _loopback(endpoint):
+                yield f"link.listen = {endpoint!r}: off the loopback interface needs link.allow_unprotected = true"
+
+
+def _loopback(endpoint: str) -> bool:
+    host = endpoint.partition("/")[2].rpartition(":")[0]
+    return host == "localhost" or host.startswith("127.") or host == "[::1]"
 
 
 def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:

@@ -38,6 +38,7 @@ TICK_DTYPE = np.dtype(
         ("reason", "u2"),  # why the mode is what it is (runtime.modes.Reason)
         ("policy", "u4"),  # generation of the active policy, counted from 1 at start
         ("asked_velocity", "f8", (3,)),  # newest operator command: vx, vy m/s, yaw rate rad/s
+        ("measured_stamp", "f8"),  # s, the body's own clock (the simulator's is simulated time)
         ("imu_stamp", "f8"),
         ("orientation", "f8", (4,)),  # w x y z, body to world
         ("angular_velocity", "f8", (3,)),  # body frame, rad/s

@@ -1,0 +1,231 @@
+"""What the robot may do next: a pure transition table, every change and every refusal with its reason.
+
+DAMP → STAND_UP → STAND ⇄ WALK, STAND → SIT_DOWN → DAMP, and DAMP from anywhere. Only an armed robot leaves DAMP, and
+every way into DAMP disarms. A fault stays until ``clear``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum, StrEnum
+from typing import assert_never
+
+from runtime.messages import Mode
+
+
+class Request(StrEnum):
+    """What the operator may ask for: the words of ``command/mode``."""
+
+    ARM = "arm"
+    STAND = "stand"
+    WALK = "walk"
+    SIT = "sit"
+    DAMP = "damp"
+    CLEAR = "clear"
+
+
+class Reason(IntEnum):
+    """Why the mode is what it is, or why a request was refused. ``words`` says it to people."""
+
+    OK = 0
+    STARTED = 1
+    REQUESTED = 2
+    ARMED = 3
+    CLEARED = 4
+    STOOD_UP = 5
+    SAT_DOWN = 6
+    COMMAND_LOST = 7
+    STOPPING = 9
+
+    NOT_ARMED = 20
+    NOT_STANDING = 21
+    NOT_DAMPED = 22
+    STILL_MOVING = 23
+    WALKING = 24
+    FAULT_STANDS = 25
+    NOT_READY = 26
+    ALREADY = 27
+
+    NOT_FINITE = 40
+    STALE_MOTOR = 41
+    STALE_IMU = 42
+    IMPLAUSIBLE_IMU = 43
+    TILTED = 44
+    MOTOR_FAULT = 45
+    HOT_MOTOR = 46
+    JOINT_SPEED = 47
+    LOW_VOLTAGE = 48
+    OVERLOAD = 49
+    BAD_COMMAND = 50
+    SOLVER_FAILED = 51
+    UNREACHABLE = 52
+    BODY_SILENT = 53
+
+    @property
+    def words(self) -> str:
+        """The reason as a person would say it."""
+        return WORDS[self]
+
+    @property
+    def is_fault(self) -> bool:
+        """Whether it takes the robot to damp and stays until cleared."""
+        return self >= Reason.NOT_FINITE
+
+
+WORDS: dict[Reason, str] = {
+    Reason.OK: "in order",
+    Reason.STARTED: "just started",
+    Reason.REQUESTED: "asked for",
+    Reason.ARMED: "armed",
+    Reason.CLEARED: "fault cleared",
+    Reason.STOOD_UP: "stood up",
+    Reason.SAT_DOWN: "sat down",
+    Reason.COMMAND_LOST: "no velocity command any more",
+    Reason.STOPPING: "the daemon is stopping",
+    Reason.NOT_ARMED: "not armed: ask for arm first",
+    Reason.NOT_STANDING: "not standing: ask for stand first",
+    Reason.NOT_DAMPED: "only in damp",
+    Reason.STILL_MOVING: "still standing up or sitting down",
+    Reason.WALKING: "walking: ask for stand first",
+    Reason.FAULT_STANDS: "a fault stands: look at it, then ask for clear",
+    Reason.NOT_READY: "not ready",
+    Reason.ALREADY: "already so",
+    Reason.NOT_FINITE: "a reading is not a number",
+    Reason.STALE_MOTOR: "a motor's reply is too old",
+    Reason.STALE_IMU: "the IMU's sample is too old",
+    Reason.IMPLAUSIBLE_IMU: "the IMU tells what cannot be",
+    Reason.TILTED: "tilted too far",
+    Reason.MOTOR_FAULT: "a motor reports a fault",
+    Reason.HOT_MOTOR: "a motor is too hot",
+    Reason.JOINT_SPEED: "a joint is too fast",
+    Reason.LOW_VOLTAGE: "the supply is too low",
+    Reason.OVERLOAD: "rms torque beyond the continuous rating",
+    Reason.BAD_COMMAND: "the computed command is not finite",
+    Reason.SOLVER_FAILED: "no ground reaction forces found",
+    Reason.UNREACHABLE: "a foot target of the posture is out of reach",
+    Reason.BODY_SILENT: "the body does not answer",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ModeState:
+    """The daemon's state as its operator sees it."""
+
+    mode: Mode = Mode.DAMP
+    armed: bool = False
+    reason: Reason = Reason.STARTED
+    fault: Reason = Reason.OK
+    """The fault that stands, or OK."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """To one request: the state after it, and whether it was accepted and why (not)."""
+
+    state: ModeState
+    accepted: bool
+    reason: Reason
+
+
+Entry = Mode | Reason
+"""A row's outcome: the mode to go to, or why not."""
+
+TABLE: dict[Request, dict[Mode, Entry]] = {
+    Request.STAND: {
+        Mode.DAMP: Mode.STAND_UP,
+        Mode.STAND_UP: Reason.ALREADY,
+        Mode.STAND: Reason.ALREADY,
+        Mode.WALK: Mode.STAND,
+        Mode.SIT_DOWN: Mode.STAND_UP,
+    },
+    Request.WALK: {
+        Mode.DAMP: Reason.NOT_STANDING,
+        Mode.STAND_UP: Reason.STILL_MOVING,
+        Mode.STAND: Mode.WALK,
+        Mode.WALK: Reason.ALREADY,
+        Mode.SIT_DOWN: Reason.STILL_MOVING,
+    },
+    Request.SIT: {
+        Mode.DAMP: Reason.NOT_STANDING,
+        Mode.STAND_UP: Mode.SIT_DOWN,
+        Mode.STAND: Mode.SIT_DOWN,
+        Mode.WALK: Reason.WALKING,
+        Mode.SIT_DOWN: Reason.ALREADY,
+    },
+}
+"""Requests that move the robot. The other three do not need a table: arm and clear work in DAMP only, damp always."""
+
+
+def request(state: ModeState, wish: Request, verdict: Reason, ready: bool) -> Answer:
+    """The answer to ``wish`` while the guard says ``verdict`` and the arming checks say ``ready``."""
+    match wish:
+        case Request.DAMP:
+            return Answer(_damped(state, Reason.REQUESTED), True, Reason.REQUESTED)
+        case Request.CLEAR:
+            return _clear(state, verdict)
+        case Request.ARM:
+            return _arm(state, verdict, ready)
+        case Request.STAND | Request.WALK | Request.SIT:
+            return _move(state, TABLE[wish][state.mode], verdict)
+        case _:
+            assert_never(wish)
+
+
+def advance(state: ModeState, verdict: Reason, finished: bool, command_lost: bool) -> ModeState:
+    """The state after one tick: a fault damps, a finished posture moves on, a lost command stops the walk.
+
+    Args:
+        state: before the tick.
+        verdict: of the guard, OK or a fault.
+        finished: the posture of STAND_UP or SIT_DOWN has reached its end.
+        command_lost: no velocity command for longer than the configuration allows.
+    """
+    if verdict is not Reason.OK and (state.armed or state.mode is not Mode.DAMP):
+        return replace(_damped(state, verdict), fault=verdict)
+    if state.mode is Mode.STAND_UP and finished:
+        return replace(state, mode=Mode.STAND, reason=Reason.STOOD_UP)
+    if state.mode is Mode.SIT_DOWN and finished:
+        return _damped(state, Reason.SAT_DOWN)
+    if state.mode is Mode.WALK and command_lost:
+        return replace(state, mode=Mode.STAND, reason=Reason.COMMAND_LOST)
+    return state
+
+
+def _damped(state: ModeState, reason: Reason) -> ModeState:
+    return replace(state, mode=Mode.DAMP, armed=False, reason=reason)
+
+
+def _refused(state: ModeState, reason: Reason) -> Answer:
+    return Answer(state, False, reason)
+
+
+def _clear(state: ModeState, verdict: Reason) -> Answer:
+    if state.mode is not Mode.DAMP:
+        return _refused(state, Reason.NOT_DAMPED)
+    if verdict is not Reason.OK:
+        return _refused(state, verdict)
+    if state.fault is Reason.OK:
+        return Answer(state, True, Reason.ALREADY)
+    return Answer(replace(state, fault=Reason.OK, reason=Reason.CLEARED), True, Reason.CLEARED)
+
+
+def _arm(state: ModeState, verdict: Reason, ready: bool) -> Answer:
+    if state.mode is not Mode.DAMP:
+        return _refused(state, Reason.NOT_DAMPED)
+    if state.fault is not Reason.OK:
+        return _refused(state, Reason.FAULT_STANDS)
+    if verdict is not Reason.OK:
+        return _refused(state, verdict)
+    if not ready:
+        return _refused(state, Reason.NOT_READY)
+    return Answer(replace(state, armed=True, reason=Reason.ARMED), True, Reason.ARMED)
+
+
+def _move(state: ModeState, entry: Entry, verdict: Reason) -> Answer:
+    if isinstance(entry, Reason):
+        return Answer(state, entry is Reason.ALREADY, entry)
+    if not state.armed:
+        return _refused(state, Reason.NOT_ARMED)
+    if verdict is not Reason.OK:
+        return _refused(state, verdict)
+    return Answer(replace(state, mode=entry, reason=Reason.REQUESTED), True, Reason.REQUESTED)

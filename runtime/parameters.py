@@ -1,0 +1,132 @@
+"""The shell's configuration: what a robot's TOML says outside ``[robot]`` and ``[control]``, every number with its unit.
+
+Every table may be left out: the defaults are those of a robot of Stoch3's size on one host.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from drivers.description import NonNegative, Positive, Record
+from runtime.control.parameters import Fraction
+
+Angle = Annotated[float, Meta(gt=0, le=3.2)]
+Endpoint = Annotated[str, Meta(pattern=r"^[a-z]+/[^\s/]+$")]
+Celsius = Annotated[float, Meta(ge=0, le=200)]
+
+
+class LimitsConfig(Record, frozen=True, kw_only=True):
+    """When the guard takes the robot to damp, and what it asks for before it arms."""
+
+    max_tilt: Angle = 0.9
+    """Between the body's z and gravity's, rad."""
+    arming_tilt: Angle = 0.35
+    """The same, for arming, rad."""
+    max_age: Positive = 0.03
+    """Of the oldest motor reply and of the IMU sample, s."""
+    max_temperature: Celsius = 80.0
+    """Of the hottest motor, °C."""
+    arming_temperature: Celsius = 65.0
+    """The same, for arming, °C."""
+    min_voltage: NonNegative = 0.0
+    """Supply below which the robot damps, V; 0 where the body has no supply to tell of."""
+    arming_voltage: NonNegative = 0.0
+    """The same, for arming, V."""
+    max_angular_velocity: Positive = 20.0
+    """An IMU that tells more is not believed, rad/s."""
+    max_acceleration: Positive = 400.0
+    """An IMU that tells more is not believed, m/s²."""
+    thermal_time: Positive = 30.0
+    """Time constant of the rms torque that is held against the continuous rating, s."""
+    joint_margin: NonNegative = 0.1
+    """How far outside its range a joint may be found at arming, rad."""
+
+
+class PostureConfig(Record, frozen=True, kw_only=True):
+    """Standing up and sitting down."""
+
+    soft_start: Positive = 0.8
+    """The gains grow from none to whole over this time, at the pose that was measured, s."""
+    fold_time: Positive = 1.0
+    """Feet to under the hips, s."""
+    rise_time: Positive = 1.5
+    """From folded to the walking height, or back, s."""
+    settle_time: NonNegative = 0.2
+    """Rest between the acts, s."""
+    blend_time: Positive = 0.3
+    """Hand-over from one source of commands to the next, s."""
+    fold_height: Annotated[float, Meta(gt=0, lt=1)] = 0.3
+    """Foot to hip when folded, as a share of thigh + shank."""
+
+
+class CommandConfig(Record, frozen=True, kw_only=True):
+    """How long a velocity command is believed."""
+
+    expiry: Positive = 0.2
+    """Older ones are ramped to zero, s."""
+    stand_after: Positive = 2.0
+    """Without any for so long, WALK becomes STAND, s."""
+
+
+class DampConfig(Record, frozen=True, kw_only=True):
+    """The safe end of everything."""
+
+    kd: Positive = 3.0
+    """Damping of every joint, N·m·s/rad."""
+    deadline: Positive = 1.0
+    """How long a stopping daemon goes on asking a silent body to damp, s."""
+
+
+class LinkConfig(Record, frozen=True, kw_only=True):
+    """The zenoh session."""
+
+    listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
+    """Where clients find the daemon."""
+    connect: tuple[Endpoint, ...] = ()
+    """Routers or peers that the daemon itself looks for."""
+    allow_unprotected: bool = False
+    """An endpoint off the loopback interface carries no encryption; it is refused unless this says otherwise."""
+    batch: Annotated[int, Meta(ge=1, le=100)] = 5
+    """Tick records in one message."""
+    status_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
+
+
+class RecorderConfig(Record, frozen=True, kw_only=True):
+    """The flight recorder."""
+
+    seconds: Annotated[float, Meta(ge=1, le=3600)] = 60.0
+    """What the ring holds, s."""
+    after_fault: NonNegative = 1.0
+    """How long the ring runs on after a fault before it is written, s."""
+    max_files: Annotated[int, Meta(ge=1)] = 20
+    """More are removed, oldest first."""
+    max_bytes: Annotated[int, Meta(ge=1_000_000)] = 2_000_000_000
+
+
+class RealtimeConfig(Record, frozen=True, kw_only=True):
+    """What is asked of the kernel; each is tried and reported, and fatal only when ``required``."""
+
+    priority: Annotated[int, Meta(ge=0, le=98)] = 0
+    """SCHED_FIFO priority of the loop's thread; 0 leaves normal scheduling."""
+    cpus: tuple[Annotated[int, Meta(ge=0, le=1023)], ...] = ()
+    """Processors that the loop's thread may use; none named, all."""
+    lock_memory: bool = False
+    """mlockall: no page of the daemon is ever swapped."""
+    freeze_garbage: bool = True
+    """No garbage collection while armed."""
+    required: bool = False
+
+
+class TourConfig(Record, frozen=True, kw_only=True):
+    """``trotd tour`` on this robot."""
+
+    speed_scale: Annotated[float, Meta(gt=0, le=3)] = 1.0
+    """Stretches every commanded linear speed of the tour."""
+    push: NonNegative = 100.0
+    """Force of each of the two pushes, N."""
+    push_time: Annotated[float, Meta(gt=0, le=1)] = 0.1
+    """s."""
+    velocity_bound: Fraction = 0.25
+    """Largest RMSE of vx and vy that passes, m/s."""
