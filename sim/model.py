@@ -7,7 +7,7 @@ the feet and knees: mesh shapes cost three to six times the whole step.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,6 +16,7 @@ from drivers.description import END, SIDE, Link, RobotDescription
 from drivers.robot import JOINTS, LEGS, Array
 
 LINKS = ("abduction_link", "thigh", "shank")
+PAYLOAD = "payload"
 AXES = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 """Joint axes in our convention. Shape (3, 3), rows abduction hip knee."""
 
@@ -76,15 +77,8 @@ class Model:
             feet[leg] = position + rotation @ self.feet[leg]
         return feet
 
-    def loaded(self, payload: float) -> Model:
-        """The same robot with a point mass of ``payload`` kg on the middle of the body's top."""
-        if payload == 0.0:
-            return self
-        top = Body("payload", payload, np.array([0.0, 0.0, self.description.body_size[2] / 2]), np.zeros((3, 3)))
-        return replace(self, bodies=(lump("body", (self.bodies[0], top)), *self.bodies[1:]))
-
     def urdf(self) -> str:
-        """The model as URDF text, rotor inertia included."""
+        """The model as URDF text, rotor inertia included, with a massless ``payload`` link on top of the body."""
         robot = ElementTree.Element("robot", name=self.description.name)
         for index, body in enumerate(self.bodies):
             axis = None if index == 0 else self.hinges[index - 1].axis
@@ -93,7 +87,16 @@ class Model:
                 _add_collision(link, position, shape)
         for index, hinge in enumerate(self.hinges):
             self._add_joint(robot, hinge, index)
+        _link_element(robot, Body(PAYLOAD, 0.0, np.zeros(3), np.zeros((3, 3))), np.zeros((3, 3)))
+        self._add_payload_joint(robot)
         return ElementTree.tostring(robot, encoding="unicode")
+
+    def _add_payload_joint(self, robot: ElementTree.Element) -> None:
+        element = ElementTree.SubElement(robot, "joint", name=PAYLOAD, type="fixed")
+        ElementTree.SubElement(element, "parent", link="body")
+        ElementTree.SubElement(element, "child", link=PAYLOAD)
+        top = np.array([0.0, 0.0, self.description.body_size[2] / 2])
+        ElementTree.SubElement(element, "origin", xyz=_numbers(top), rpy="0 0 0")
 
     def _shapes(self, index: int) -> list[tuple[Array, dict[str, dict[str, str]]]]:
         description = self.description

@@ -16,6 +16,7 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from math import copysign
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from drivers.description import RobotDescription
 from drivers.robot import JOINTS, LEGS, Array, JointCommand, Measurement
-from sim.model import Model, build_model, rpy_rotation, standing_pose
+from sim.model import PAYLOAD, Model, build_model, rpy_rotation, standing_pose
 from sim.scenario import Push, Scenario
 from sim.sensors import Sensors
 from sim.terrain import HeightField, Plane, Slope, Steps, Terrain
@@ -32,6 +33,13 @@ from sim.urdf import read_model
 
 GRAVITY = 9.81
 """m/s²."""
+UPWARDS = np.array([0.0, 0.0, GRAVITY])
+"""What an accelerometer at rest feels, world frame, m/s²."""
+FAR = 100.0
+"""Height at which nothing touches anything, m."""
+STICKING_SPEED = 0.1
+"""Dry friction grows linearly up to this joint speed, rad/s: a hard sign would chatter, a constraint would cost as much
+as the rest of the step."""
 JOINT_NAMES = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
 
 
@@ -114,7 +122,10 @@ class World:
         self._dt = self.period / self.substeps
         self._stand = standing_pose(description, walking_height)
         self._model = build_model(description) if description.urdf is None else read_model(description, urdf_search)
+        self._friction = description.joints.friction_torque
         self._sensors = Sensors(description.joints)
+        self._urdf = self._model.urdf()
+        self._built: Terrain | None = None
         self._client = -1
         with _silenced():
             self._client = self._bullet.connect(self._bullet.DIRECT)
@@ -166,12 +177,13 @@ class World:
         """
         measurement = self._measurement
         self._pending.append((self._ticks * self.substeps + self._delay, _law(command)))
-        squares = [0.0] * 12
+        torques = []
         for index in range(self._ticks * self.substeps, (self._ticks + 1) * self.substeps):
             self._physics_step(index)
-            squares = [total + torque * torque for total, torque in zip(squares, self._torque, strict=True)]
+            torques.append(self._torque)
         self._ticks += 1
-        self._sensors.warm(np.array(squares).reshape(4, 3) / self.substeps, self.period)
+        history = np.array(torques)
+        self._sensors.warm(((history * history).sum(axis=0) / self.substeps).reshape(4, 3), self.period)
         self._measurement = self._sense()
         return measurement
 
@@ -218,9 +230,15 @@ class World:
             torque if -peak < (torque := c - p * state[0] - d * state[1]) < peak else (peak if torque > 0 else -peak)
             for state, c, p, d, peak in zip(self._states, law.constant, law.kp, law.kd, self._peak, strict=True)
         ]
+        friction, slope = self._friction, self._friction / STICKING_SPEED
+        applied = [
+            torque
+            - (speed * slope if -STICKING_SPEED < (speed := state[1]) < STICKING_SPEED else copysign(friction, speed))
+            for torque, state in zip(self._torque, self._states, strict=True)
+        ]
         bullet, robot, client = self._bullet, self._robot, self._client
         bullet.setJointMotorControlArray(
-            robot, self._joints, bullet.TORQUE_CONTROL, forces=self._torque, physicsClientId=client
+            robot, self._joints, bullet.TORQUE_CONTROL, forces=applied, physicsClientId=client
         )
         if self._pushes:
             self._apply_pushes((index + 0.5) * self._dt)
@@ -242,15 +260,14 @@ class World:
         self._position, self._rotation = self._pose()
         linear, angular = self._bullet.getBaseVelocity(self._robot, physicsClientId=self._client)
         self._angular_velocity = np.array(angular)
-        self._velocity = np.array(linear) - np.cross(self._angular_velocity, self._rotation @ self._com)
+        self._velocity = np.array(linear) - _cross(angular, (self._rotation @ self._com).tolist())
         world_to_body = self._rotation.T
-        specific_force = world_to_body @ ((self._velocity - before) / self.period + [0.0, 0.0, GRAVITY])
         position, velocity = self._joint_arrays()
         return self._sensors.read(
             self.time,
             _quaternion(self._rotation),
             world_to_body @ self._angular_velocity,
-            specific_force,
+            world_to_body @ ((self._velocity - before) / self.period + UPWARDS),
             (position, velocity, np.array(self._torque).reshape(4, 3)),
         )
 
@@ -276,30 +293,57 @@ class World:
         return contacts, forces
 
     def _start(self, scenario: Scenario) -> None:
-        """Build everything anew: the only reset that provably leaves nothing of the last episode."""
+        """Put robot and ground where ``scenario`` wants them, with nothing of the last episode left.
+
+        On level and tilted planes PyBullet's own state ends with one step far from the ground, so the bodies are kept;
+        elsewhere its broad phase remembers the past in the order of its pairs, so everything is built anew.
+        """
+        bullet, client = self._bullet, self._client
+        if scenario.terrain != self._built or not isinstance(scenario.terrain, Plane | Slope):
+            self._build(scenario.terrain)
+        self._place(np.array([0.0, 0.0, FAR]), np.eye(3), np.zeros(3), self._stand)
+        bullet.stepSimulation(physicsClientId=client)
+        for body in self._ground:
+            bullet.changeDynamics(body, -1, lateralFriction=scenario.friction, physicsClientId=client)
+        bullet.changeDynamics(
+            self._robot,
+            self._payload,
+            mass=scenario.payload,
+            localInertiaDiagonal=(0.0, 0.0, 0.0),
+            physicsClientId=client,
+        )
+        joint_position = self._stand if scenario.joint_position is None else scenario.joint_position
+        rotation = rpy_rotation(scenario.rpy)
+        height = scenario.height
+        if height is None:
+            height = self._resting_height(scenario, rotation, joint_position)
+        origin = np.array([*scenario.position_xy, height])
+        self._place(origin, rotation, np.array(scenario.velocity, dtype=float), joint_position)
+
+    def _build(self, terrain: Terrain) -> None:
         bullet, client = self._bullet, self._client
         bullet.resetSimulation(physicsClientId=client)
         bullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=self._dt, deterministicOverlappingPairs=1, enableFileCaching=0, physicsClientId=client
         )
-        self._ground = self._build_ground(scenario.terrain)
-        for body in self._ground:
-            bullet.changeDynamics(body, -1, lateralFriction=scenario.friction, physicsClientId=client)
-        self._load_robot(self._model.loaded(scenario.payload))
-        self._place(scenario)
+        self._ground = self._build_ground(terrain)
+        self._load_robot()
+        self._built = terrain
 
-    def _load_robot(self, model: Model) -> None:
+    def _load_robot(self) -> None:
         bullet, client = self._bullet, self._client
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
-            file.write(model.urdf())
+            file.write(self._urdf)
             file.flush()
             self._robot = bullet.loadURDF(file.name, flags=bullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client)
-        infos = [bullet.getJointInfo(self._robot, joint, physicsClientId=client) for joint in range(12)]
+        count = bullet.getNumJoints(self._robot, physicsClientId=client)
+        infos = [bullet.getJointInfo(self._robot, joint, physicsClientId=client) for joint in range(count)]
         index = {info[1].decode(): info[0] for info in infos}
         self._joints = [index[name] for name in JOINT_NAMES]
+        self._payload = index[PAYLOAD]
         self._foot_of_link = {self._joints[3 * leg + 2]: leg for leg in range(4)}
-        for link in range(-1, 12):
+        for link in range(-1, count):
             bullet.changeDynamics(
                 self._robot,
                 link,
@@ -309,28 +353,20 @@ class World:
                 maxJointVelocity=1e3,
                 physicsClientId=client,
             )
-        friction = self.description.joints.friction_torque
         bullet.setJointMotorControlArray(
-            self._robot, self._joints, bullet.VELOCITY_CONTROL, forces=[friction] * 12, physicsClientId=client
+            self._robot, self._joints, bullet.VELOCITY_CONTROL, forces=[0.0] * 12, physicsClientId=client
         )
         info = bullet.getDynamicsInfo(self._robot, -1, physicsClientId=client)
         self._com, self._principal = np.array(info[3]), _matrix(info[4])
 
-    def _place(self, scenario: Scenario) -> None:
-        bullet, client = self._bullet, self._client
-        joint_position = self._stand if scenario.joint_position is None else scenario.joint_position
-        rotation = rpy_rotation(scenario.rpy)
-        height = scenario.height
-        if height is None:
-            height = self._resting_height(scenario, rotation, joint_position)
-        origin = np.array([*scenario.position_xy, height])
+    def _place(self, origin: Array, rotation: Array, velocity: Array, joint_position: Array) -> None:
+        bullet, robot, client = self._bullet, self._robot, self._client
         w, x, y, z = _quaternion(rotation @ self._principal)
-        bullet.resetBasePositionAndOrientation(
-            self._robot, (origin + rotation @ self._com).tolist(), (x, y, z, w), physicsClientId=client
-        )
-        bullet.resetBaseVelocity(self._robot, scenario.velocity, (0.0, 0.0, 0.0), physicsClientId=client)
-        for joint, angle in zip(self._joints, np.ravel(joint_position), strict=True):
-            bullet.resetJointState(self._robot, joint, float(angle), 0.0, physicsClientId=client)
+        centre = (origin + rotation @ self._com).tolist()
+        bullet.resetBasePositionAndOrientation(robot, centre, (x, y, z, w), physicsClientId=client)
+        bullet.resetBaseVelocity(robot, velocity.tolist(), (0.0, 0.0, 0.0), physicsClientId=client)
+        for joint, angle in zip(self._joints, np.ravel(joint_position).tolist(), strict=True):
+            bullet.resetJointState(robot, joint, angle, 0.0, physicsClientId=client)
 
     def _resting_height(self, scenario: Scenario, rotation: Array, joint_position: Array) -> float:
         """Body origin above z = 0 at which the first foot's sphere touches the ground, m."""
@@ -387,10 +423,10 @@ class World:
 
     def _check_inertia(self) -> None:
         """PyBullet zeroes an inertia that it does not believe and only prints a warning."""
-        for link in range(-1, 12):
+        for body, link in zip(self._model.bodies, [-1, *self._joints], strict=True):
             inertia = self._bullet.getDynamicsInfo(self._robot, link, physicsClientId=self._client)[2]
             if min(inertia) <= 0.0:
-                name = self._model.bodies[link + 1].name
+                name = body.name
                 self.close()
                 raise SimulatorError(
                     f"link {name}: PyBullet turned its inertia into {inertia}; it breaks the triangle rule"
@@ -410,6 +446,10 @@ def _disc(radius: float) -> list[tuple[float, float]]:
     angles = [index * math.pi / 6 for index in range(12)]
     rings = [(r * math.cos(a), r * math.sin(a)) for r in (radius / 2, 0.99 * radius) for a in angles]
     return [(0.0, 0.0), *rings]
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> Array:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def _matrix(orientation: Sequence[float]) -> Array:
