@@ -14,6 +14,7 @@ import numpy as np
 
 from drivers.description import END, SIDE, Link, RobotDescription
 from drivers.robot import JOINTS, LEGS, Array
+from sim.rotation import about_axis, to_rpy
 
 LINKS = ("abduction_link", "thigh", "shank")
 PAYLOAD = "payload"
@@ -73,7 +74,7 @@ class Model:
             position, rotation = np.zeros(3), np.eye(3)
             for hinge, angle in zip(self.hinges[3 * leg : 3 * leg + 3], joint_position[leg], strict=True):
                 position = position + rotation @ hinge.origin
-                rotation = rotation @ hinge.rotation @ axis_rotation(hinge.axis, angle)
+                rotation = rotation @ hinge.rotation @ about_axis(hinge.axis, angle)
             feet[leg] = position + rotation @ self.feet[leg]
         return feet
 
@@ -114,7 +115,7 @@ class Model:
         element = ElementTree.SubElement(robot, "joint", name=hinge.name, type="revolute")
         ElementTree.SubElement(element, "parent", link=hinge.parent)
         ElementTree.SubElement(element, "child", link=hinge.child)
-        ElementTree.SubElement(element, "origin", xyz=_numbers(hinge.origin), rpy=_numbers(rpy_of(hinge.rotation)))
+        ElementTree.SubElement(element, "origin", xyz=_numbers(hinge.origin), rpy=_numbers(to_rpy(hinge.rotation)))
         ElementTree.SubElement(element, "axis", xyz=_numbers(hinge.axis))
         ElementTree.SubElement(
             element,
@@ -179,30 +180,6 @@ def lump(name: str, bodies: tuple[Body, ...]) -> Body:
         d = body.com - com
         inertia += body.inertia + body.mass * (np.dot(d, d) * np.eye(3) - np.outer(d, d))
     return Body(name, mass, com, inertia)
-
-
-def axis_rotation(axis: Array, angle: float) -> Array:
-    """Rotation by ``angle`` rad about the unit vector ``axis`` (Rodrigues). Shape (3, 3)."""
-    x, y, z = axis
-    skew: Array = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: Array = np.eye(3) + math.sin(angle) * skew + (1 - math.cos(angle)) * (skew @ skew)
-    return rotation
-
-
-def rpy_rotation(rpy: Array | tuple[float, float, float]) -> Array:
-    """Rotation matrix of roll, pitch, yaw in rad (URDF's order: yaw · pitch · roll). Shape (3, 3)."""
-    roll, pitch, yaw = rpy
-    x, y, z = np.eye(3)
-    return axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
-
-
-def rpy_of(rotation: Array) -> Array:
-    """Roll, pitch, yaw of a rotation matrix, rad. Shape (3,)."""
-    pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
-    if math.cos(pitch) < 1e-9:
-        return np.array([math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])
-    roll = math.atan2(rotation[2, 1], rotation[2, 2])
-    return np.array([roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])])
 
 
 def _mirrored(name: str, link: Link, mirror: Array) -> Body:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from drivers.robot import Array
 from sim.terrain import Plane, Terrain
 
@@ -89,3 +91,6 @@ class Scenario:
         for name in ("friction", "payload", "motor_strength", "extra_delay"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"scenario {name} = {getattr(self, name)}: must be finite and not negative")
+        pose = self.joint_position
+        if pose is not None and (pose.shape != (4, 3) or not np.isfinite(pose).all()):
+            raise ValueError(f"scenario joint_position of shape {pose.shape}: must be (4, 3) and finite")

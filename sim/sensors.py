@@ -6,6 +6,7 @@ import numpy as np
 
 from drivers.description import JointLimits
 from drivers.robot import Array, ImuSample, JointState, Measurement
+from sim.rotation import turned
 from sim.scenario import Noise
 
 AMBIENT = 25.0
@@ -25,6 +26,8 @@ class Sensors:
         self._continuous = np.array(limits.continuous_torque)
         self._no_fault = np.zeros((4, 3), dtype=np.int32)
         self._no_age = np.zeros((4, 3))
+        for shared in (self._no_fault, self._no_age):
+            shared.setflags(write=False)
         self.reset(Noise(), 0)
 
     def reset(self, noise: Noise, seed: int) -> None:
@@ -68,7 +71,7 @@ class Sensors:
             position = position + self._position_bias + noise.joint_position * draw((4, 3))
             velocity = velocity + noise.joint_velocity * draw((4, 3))
             torque = torque + self._torque_bias + noise.joint_torque * draw((4, 3))
-            orientation = _tilted(orientation, self._tilt_bias + noise.orientation * draw(3))
+            orientation = turned(orientation, self._tilt_bias + noise.orientation * draw(3))
             angular_velocity = angular_velocity + self._rate_bias + noise.angular_velocity * draw(3)
             specific_force = specific_force + self._force_bias + noise.linear_acceleration * draw(3)
         return Measurement(
@@ -77,20 +80,3 @@ class Sensors:
             joints=JointState(position, velocity, torque, self._temperature, self._no_fault, self._no_age),
             voltage=VOLTAGE,
         )
-
-
-def _tilted(orientation: Array, rotation_vector: Array) -> Array:
-    """Quaternion wxyz turned by a small rotation vector in its own frame."""
-    w, x, y, z = orientation
-    angle = float(np.linalg.norm(rotation_vector))
-    scale = 0.5 if angle < 1e-9 else np.sin(angle / 2) / angle
-    a, (b, c, d) = np.cos(angle / 2), scale * rotation_vector
-    turned: Array = np.array(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )
-    return turned / float(np.linalg.norm(turned))

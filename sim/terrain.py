@@ -126,3 +126,20 @@ class HeightField:
 
 
 Terrain = Plane | Slope | Steps | HeightField
+
+
+def resting_height(terrain: Terrain, feet: Array, radius: float) -> float:
+    """How far the feet must rise for the first one just to touch the ground, m.
+
+    Args:
+        terrain: the ground.
+        feet: centres of the feet's spheres, m. Shape (4, 3).
+        radius: of the spheres, m; each is sampled on two rings.
+    """
+    angles = [index * math.pi / 6 for index in range(12)]
+    disc = [(0.0, 0.0), *((r * math.cos(a), r * math.sin(a)) for r in (radius / 2, 0.99 * radius) for a in angles)]
+    return max(
+        terrain.height_at(x + dx, y + dy) + math.sqrt(max(radius**2 - dx**2 - dy**2, 0.0)) - z
+        for x, y, z in feet.tolist()
+        for dx, dy in disc
+    )

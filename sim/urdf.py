@@ -14,16 +14,14 @@ import numpy as np
 
 from drivers.description import RobotDescription, UrdfMap
 from drivers.robot import JOINTS, LEGS, Array
-from sim.model import LINKS, Body, Hinge, Model, axis_rotation, build_model, lump, rpy_rotation, standing_pose
+from sim.errors import UrdfError
+from sim.model import LINKS, Body, Hinge, Model, build_model, lump, standing_pose
+from sim.rotation import about_axis, from_rpy
 
 TOLERANCE = 2e-3
 """How far a foot of the URDF may lie from where the TOML's geometry puts it, m."""
 MASS_TOLERANCE = 0.02
 """Share by which the URDF's whole mass may differ from the TOML's."""
-
-
-class UrdfError(ValueError):
-    """A URDF that cannot be read or does not fit its robot's TOML."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +61,10 @@ def read_model(description: RobotDescription, search: Path | None) -> Model:
     try:
         root = ElementTree.parse(path).getroot()
         model = _Reader(root, mapping).model(description)
-    except (ElementTree.ParseError, KeyError, TypeError) as error:
-        raise UrdfError(f"{path}: not a URDF that can be read: {error!r}") from error
     except UrdfError as error:
         raise UrdfError(f"{path}: {error}") from error
+    except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
+        raise UrdfError(f"{path}: not a URDF that can be read: {error!r}") from error
     check_model(model, path)
     return model
 
@@ -125,7 +123,10 @@ class _Reader:
         missing = sorted(self._mapped - {joint.name for joint in joints}) + sorted(set(mapping.feet) - set(self._links))
         if missing:
             raise UrdfError(f"has no {', '.join(missing)}")
-        self._top = next(iter(set(self._links) - {joint.child for joint in joints}))
+        tops = sorted(set(self._links) - {joint.child for joint in joints})
+        if len(tops) != 1:
+            raise UrdfError(f"must have one root link, has {', '.join(tops) or 'none'}")
+        self._top = tops[0]
 
     def model(self, description: RobotDescription) -> Model:
         group = self._group(self._top)
@@ -154,7 +155,7 @@ class _Reader:
         sign, offset = self._mapping.sign[joint], self._mapping.offset[joint]
         if abs(sign) != 1.0:
             raise UrdfError(f"urdf sign[{joint}] = {sign}: must be 1 or -1")
-        return Hinge(name, parent, child, origin, rotation @ axis_rotation(raw.axis, offset), sign * raw.axis)
+        return Hinge(name, parent, child, origin, rotation @ about_axis(raw.axis, offset), sign * raw.axis)
 
     def _group(self, top: str) -> _Group:
         group = _Group()
@@ -221,7 +222,7 @@ def _read_origin(element: ElementTree.Element) -> tuple[Array, Array]:
     origin = element.find("origin")
     if origin is None:
         return np.zeros(3), np.eye(3)
-    return _vector(origin.get("xyz", "0 0 0")), rpy_rotation(_vector(origin.get("rpy", "0 0 0")))
+    return _vector(origin.get("xyz", "0 0 0")), from_rpy(_vector(origin.get("rpy", "0 0 0")))
 
 
 def _vector(text: str) -> Array:

@@ -1,0 +1,93 @@
+"""Twelve servos: the one motor law at every physics step, its limits, its dry friction and the way commands reach it.
+
+Plain floats in lists: at twelve joints they cost a third of numpy, and the physics engine wants lists.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from math import copysign
+from typing import Any
+
+import numpy as np
+
+from drivers.description import JointLimits
+from drivers.robot import JointCommand
+
+STICKING_SPEED = 0.1
+"""Dry friction grows linearly up to this joint speed, rad/s: a hard sign would chatter, and a constraint in the physics
+engine would cost as much as the rest of the step."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Law:
+    """A command as the motors run it: torque = constant - kp q - kd q̇, twelve numbers each."""
+
+    constant: list[float]
+    kp: list[float]
+    kd: list[float]
+
+
+_LIMP = _Law([0.0] * 12, [0.0] * 12, [0.0] * 12)
+
+
+class Motors:
+    """The servos of one episode. They are without torque until the first command reaches them."""
+
+    def __init__(self, limits: JointLimits) -> None:
+        self._limits = limits
+        self._friction = limits.friction_torque
+        self.reset(1.0, 0)
+
+    def reset(self, strength: float, delay: int) -> None:
+        """Start an episode.
+
+        Args:
+            strength: share of the peak torque that the motors reach.
+            delay: physics steps between a command's arrival and its effect.
+        """
+        self._peak = [strength * peak for peak in self._limits.peak_torque] * 4
+        self._delay = delay
+        self._law = _LIMP
+        self._pending: deque[tuple[int, _Law]] = deque()
+        self.torque = [0.0] * 12
+        """What the motors exert on the joints since the last physics step, N·m."""
+
+    def take(self, command: JointCommand, step: int) -> None:
+        """Receive ``command`` at physics step ``step``.
+
+        Raises:
+            ValueError: a number in ``command`` is not finite.
+        """
+        self._pending.append((step + self._delay, _law(command)))
+
+    def drive(self, step: int, states: Sequence[Any]) -> list[float]:
+        """Torque on each joint in physics step ``step``, motor and dry friction together, N·m.
+
+        Args:
+            step: counted from the reset.
+            states: position rad and velocity rad/s of each joint, as the first two entries of twelve tuples.
+        """
+        while self._pending and self._pending[0][0] <= step:
+            self._law = self._pending.popleft()[1]
+        law = self._law
+        self.torque = [
+            torque if -peak < (torque := c - p * state[0] - d * state[1]) < peak else copysign(peak, torque)
+            for state, c, p, d, peak in zip(states, law.constant, law.kp, law.kd, self._peak, strict=True)
+        ]
+        friction, bound = self._friction, STICKING_SPEED
+        slope = friction / bound
+        return [
+            torque - (speed * slope if -bound < (speed := state[1]) < bound else copysign(friction, speed))
+            for torque, state in zip(self.torque, states, strict=True)
+        ]
+
+
+def _law(command: JointCommand) -> _Law:
+    constant = command.torque + command.kp * command.position + command.kd * command.velocity
+    if not (np.isfinite(constant).all() and np.isfinite(command.kp).all() and np.isfinite(command.kd).all()):
+        names = [item.name for item in fields(command) if not np.isfinite(getattr(command, item.name)).all()]
+        raise ValueError(f"joint command {', '.join(names) or 'torque'}: not finite")
+    return _Law(constant.ravel().tolist(), command.kp.ravel().tolist(), command.kd.ravel().tolist())
