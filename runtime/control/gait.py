@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -10,24 +11,36 @@ import numpy as np
 from drivers.robot import Array
 from runtime.control.parameters import GaitConfig
 
-GAITS: dict[str, tuple[tuple[float, float, float, float], float | None]] = {
-    # when FL FR BL BR begin their swing, as a share of the cycle, and the duty factor (None: from the config's times)
-    "trot": ((0.0, 0.5, 0.5, 0.0), None),
-    "walk": ((0.25, 0.75, 0.0, 0.5), 0.75),
-    "pace": ((0.0, 0.5, 0.0, 0.5), None),
-    "bound": ((0.0, 0.0, 0.5, 0.5), None),
-    "pronk": ((0.0, 0.0, 0.0, 0.0), None),
-    "stand": ((0.0, 0.0, 0.0, 0.0), 1.0),
+
+class GaitPattern(NamedTuple):
+    """One gait of the table."""
+
+    begins: tuple[float, float, float, float]
+    """When FL FR BL BR begin their swing, as a share of the cycle."""
+    duty: float | None
+    """Share of the cycle in stance; None: the configured times say it."""
+    quickness: float = 1.0
+    """Swing time over the configured one: pairs on one side or end tip over, and so must step quicker."""
+
+
+GAITS: dict[str, GaitPattern] = {
+    "trot": GaitPattern((0.0, 0.5, 0.5, 0.0), None),
+    "walk": GaitPattern((0.25, 0.75, 0.0, 0.5), 0.75),
+    "pace": GaitPattern((0.0, 0.5, 0.0, 0.5), 0.5, 0.75),
+    "bound": GaitPattern((0.0, 0.0, 0.5, 0.5), 0.6, 0.75),
+    "pronk": GaitPattern((0.0, 0.0, 0.0, 0.0), None),
+    "stand": GaitPattern((0.0, 0.0, 0.0, 0.0), 1.0),
 }
 
 
 def gait_table(gait: GaitConfig) -> tuple[Array, float, float]:
     """Phase offsets (4,) of a gait, its swing time and its stance time, s."""
-    begins, duty = GAITS[gait.name]
+    pattern = GAITS[gait.name]
+    swing_time = gait.swing_time * pattern.quickness
     stance_time = gait.stance_time
-    if duty is not None and duty < 1.0:
-        stance_time = gait.swing_time * duty / (1.0 - duty)
-    return (1.0 - np.array(begins)) % 1.0, gait.swing_time, stance_time
+    if pattern.duty is not None and pattern.duty < 1.0:
+        stance_time = swing_time * pattern.duty / (1.0 - pattern.duty)
+    return (1.0 - np.array(pattern.begins)) % 1.0, swing_time, stance_time
 
 
 @numba.njit(cache=True)

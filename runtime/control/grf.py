@@ -1,4 +1,4 @@
-"""Wrench distribution: the quadratic programme of Eq. 3-4, built, checked and its fallback. Method: Wrench distribution.
+"""Wrench distribution: the quadratic programme of Eq. 3-4, built and checked, and its fallback.
 
 Only stance legs are variables, so the problem has 3, 6, 9 or 12 of them::
 
@@ -64,7 +64,8 @@ def aim_wrench(p, policy, t):  # type: ignore[no-untyped-def]
 def build_qp(p, t, com, buffer, gradient):  # type: ignore[no-untyped-def]
     """Write Q and c of this tick's stance legs; ``com`` (3,) is the centre of mass in the heading frame.
 
-    Q lies row by row at the start of ``buffer`` (144,), c at the start of ``gradient`` (12,). Returns the number of stance legs, or -1 where a number is not finite.
+    Q lies row by row at the start of ``buffer`` (144,), c at the start of ``gradient`` (12,). Returns the
+    number of stance legs, or -1 where a number is not finite.
     """
     h = p.wrench_weight
     b = t.target_wrench

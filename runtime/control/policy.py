@@ -69,7 +69,7 @@ class Policy(Record, frozen=True, kw_only=True):
     hidden: tuple[tuple[Number, ...], ...] = ()
     """First layer of the small fully-connected policy, tanh, instead of ``matrix``."""
     readout: tuple[tuple[Number, ...], ...] = ()
-    provenance: dict[str, Any] = {}
+    provenance: dict[str, Any] = msgspec.field(default_factory=dict)
     """How it was made."""
 
     @property

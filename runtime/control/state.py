@@ -142,7 +142,7 @@ def build_parameters(description: RobotDescription, config: ControlConfig) -> Re
     p["dt"], p["mass"], p["com"] = 1.0 / config.rate_hz, description.mass, com
     p["nominal_footholds"] = description.hips[:, :2]
     p["nominal_footholds"][:, 0] += com[0]
-    p["nominal_footholds"][:, 1] += SIDE * description.abduction_length
+    p["nominal_footholds"][:, 1] += SIDE * description.abduction_length + com[1]
     set_gait(parameters, config)
     gains, grf, bounds, contact = config.gains, config.grf, config.bounds, config.contact
     p["kp"], p["kd"] = gains.kp, gains.kd
