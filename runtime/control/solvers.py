@@ -59,7 +59,7 @@ class DaqpSolver:
         lower, upper = force_bounds(legs, problem.friction, problem.min_force, problem.max_force)
         rows = pyramid(legs, problem.friction)
         model = self._model()
-        model.settings = {"iter_limit": 200}
+        model.settings = {"iter_limit": 200, "primal_tol": 1e-9}
         model.setup(
             problem.hessian,
             problem.gradient,
@@ -102,7 +102,10 @@ class ProxqpSolver:
         upper = np.concatenate([np.zeros(PYRAMID_ROWS * legs), np.full(legs, problem.max_force)])
         lower = np.concatenate([np.full(PYRAMID_ROWS * legs, -1e20), np.full(legs, problem.min_force)])
         qp = self._proxqp.dense.QP(3 * legs, 0, len(rows))
-        qp.settings.eps_abs = 1e-9
+        qp.settings.eps_abs = 1e-10
+        qp.settings.check_duality_gap = True  # without it a side force lies up to 10 µN off the edge that holds it
+        qp.settings.eps_duality_gap_abs = 1e-9
+        qp.settings.eps_duality_gap_rel = 0.0
         qp.settings.eps_rel = 0.0
         qp.settings.eps_primal_inf = 1e-12
         qp.settings.eps_dual_inf = 1e-12
