@@ -33,7 +33,8 @@ def horizon(rng: np.random.Generator, stance: np.ndarray | None = None) -> Horiz
     reference[:, 8] = rng.uniform(-1, 1)
     state[8] += reference[0, 8]
     feet = np.tile(FEET, (HORIZON, 1, 1)) + rng.normal(0, 0.02, (HORIZON, 4, 3))
-    return Horizon(state, reference, feet, trot_stance() if stance is None else stance)
+    expected = state[:3] + reference[:, 3:6] * CONFIG.dt * np.arange(HORIZON)[:, None]
+    return Horizon(state, reference, expected, feet, trot_stance() if stance is None else stance)
 
 
 def test_the_sparse_form_has_the_papers_144_variables() -> None:
@@ -79,12 +80,12 @@ def roll_out(asked: Horizon, forces: Array) -> Array:
     """The model's own words, a step at a time: an oracle that shares only A_k and B_k's definition."""
     states, x = [], asked.state.copy()
     for k in range(HORIZON):
-        position, yaw = (asked.reference[k, :3], asked.reference[k, 8]) if k else (asked.state[:3], asked.state[8])
+        yaw = asked.reference[k, 8] if k else asked.state[8]
         column = x.reshape(-1, 1).copy()
         mpc.drift(column, yaw, CONFIG.dt)
-        x = column[:, 0] + mpc.input_matrix(asked.feet[k], position, yaw, BODY.mass, BODY.inertia, CONFIG.dt) @ (
-            forces[k].ravel()
-        )
+        x = column[:, 0] + mpc.input_matrix(
+            asked.feet[k], asked.expected[k], yaw, BODY.mass, BODY.inertia, CONFIG.dt
+        ) @ (forces[k].ravel())
         x[2] -= 0.5 * CONFIG.dt**2 * GRAVITY
         x[5] -= CONFIG.dt * GRAVITY
         states.append(x)
@@ -157,7 +158,13 @@ def test_standing_still_needs_the_weight() -> None:
     state = np.zeros(STATES)
     state[2] = HEIGHT
     everywhere = np.ones((HORIZON, 4), dtype=bool)
-    asked = Horizon(state, np.tile(state, (HORIZON, 1)), np.tile(FEET, (HORIZON, 1, 1)), everywhere)
+    asked = Horizon(
+        state,
+        np.tile(state, (HORIZON, 1)),
+        np.tile(state[:3], (HORIZON, 1)),
+        np.tile(FEET, (HORIZON, 1, 1)),
+        everywhere,
+    )
     forces = mpc.solve_mpc(asked, BODY, CONFIG)
     assert forces[0, :, 2].sum() == pytest.approx(25.0 * GRAVITY, rel=0.05)
     np.testing.assert_allclose(forces[0, :, :2], 0.0, atol=0.5)

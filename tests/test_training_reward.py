@@ -26,7 +26,15 @@ def sample(rng: np.random.Generator) -> dict[str, Array]:
 
 def features(state: dict[str, Array]) -> Array:
     out = np.empty(FEATURES)
-    reward.fill_features(*state.values(), WEIGHT, out)
+    reward.fill_features(
+        state["position"],
+        state["velocity"],
+        rotation(state["rpy"]),
+        state["angular_velocity"],
+        state["grf"],
+        WEIGHT,
+        out,
+    )
     return out
 
 

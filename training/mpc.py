@@ -39,7 +39,7 @@ class MpcConfig:
     velocity_weight: tuple[float, float, float] = (20.0, 20.0, 5.0)
     rpy_weight: tuple[float, float, float] = (200.0, 200.0, 50.0)
     angular_velocity_weight: tuple[float, float, float] = (0.5, 0.5, 1.0)
-    force_weight: float = 1e-4
+    force_weight: float = 1e-5
     friction: float = 0.6
     min_force: float = 5.0
     """Of a stance leg, N."""
@@ -58,6 +58,8 @@ class Horizon(NamedTuple):
     """Now. Shape (12,)."""
     reference: Array
     """After each step. Shape (horizon, 12)."""
+    expected: Array
+    """Where the centre of mass is expected at the start of each step: the arms of the forces. Shape (horizon, 3)."""
     feet: Array
     """Contact points in the world during each step, m. Shape (horizon, 4, 3)."""
     stance: NDArray[np.bool_]
@@ -82,16 +84,16 @@ class Problem(NamedTuple):
 def build_condensed(horizon: Horizon, body: RigidBody, config: MpcConfig) -> Problem:
     """Forces of the stance legs only, step by step and leg by leg."""
     return Problem(*_condense(
-        horizon.state, horizon.reference, horizon.feet, horizon.stance, body.mass, body.inertia, config.dt,
-        config.state_weight, config.force_weight, config.friction, config.min_force, config.max_force,
+        horizon.state, horizon.reference, horizon.expected, horizon.feet, horizon.stance, body.mass, body.inertia,
+        config.dt, config.state_weight, config.force_weight, config.friction, config.min_force, config.max_force,
     ))  # fmt: skip
 
 
 def build_sparse(horizon: Horizon, body: RigidBody, config: MpcConfig) -> Problem:
     """The paper's 144 variables: x_1 … x_6, then u_0 … u_5. Dynamics are rows with equal bounds."""
     return Problem(*_spread(
-        horizon.state, horizon.reference, horizon.feet, horizon.stance, body.mass, body.inertia, config.dt,
-        config.state_weight, config.force_weight, config.friction, config.min_force, config.max_force,
+        horizon.state, horizon.reference, horizon.expected, horizon.feet, horizon.stance, body.mass, body.inertia,
+        config.dt, config.state_weight, config.force_weight, config.friction, config.min_force, config.max_force,
     ))  # fmt: skip
 
 
@@ -216,7 +218,7 @@ def _pyramid(rows, lower, upper, first_row, first_bound, variable, friction):  #
 
 @numba.njit(cache=True)
 def _condense(  # type: ignore[no-untyped-def]
-    state, reference, feet, stance, mass, inertia, dt, weight, force_weight, friction, min_force, max_force
+    state, reference, expected, feet, stance, mass, inertia, dt, weight, force_weight, friction, min_force, max_force
 ):
     steps = reference.shape[0]
     contacts = np.sum(stance)
@@ -228,9 +230,8 @@ def _condense(  # type: ignore[no-untyped-def]
     free = state.copy().reshape(STATES, 1)
     done = 0
     for k in range(steps):
-        position = reference[k, P:V] if k else state[P:V]
         yaw = reference[k, R + 2] if k else state[R + 2]
-        b = input_matrix(feet[k], position, yaw, mass, inertia, dt)
+        b = input_matrix(feet[k], expected[k], yaw, mass, inertia, dt)
         drift(influence[:, :done], yaw, dt)
         drift(free, yaw, dt)
         _fall(free, dt)
@@ -258,7 +259,7 @@ def _condense(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _spread(  # type: ignore[no-untyped-def]
-    state, reference, feet, stance, mass, inertia, dt, weight, force_weight, friction, min_force, max_force
+    state, reference, expected, feet, stance, mass, inertia, dt, weight, force_weight, friction, min_force, max_force
 ):
     steps = reference.shape[0]
     states = steps * STATES
@@ -269,7 +270,6 @@ def _spread(  # type: ignore[no-untyped-def]
     lower, upper = np.zeros(n + rows.shape[0]), np.zeros(n + rows.shape[0])
     lower[:states], upper[:states] = -INFINITE, INFINITE
     for k in range(steps):
-        position = reference[k, P:V] if k else state[P:V]
         yaw = reference[k, R + 2] if k else state[R + 2]
         start, forces = k * STATES, states + k * 12
         for i in range(STATES):
@@ -285,7 +285,7 @@ def _spread(  # type: ignore[no-untyped-def]
         else:
             constant[:, 0] = transition @ state
         _fall(constant, dt)
-        rows[start : start + STATES, forces : forces + 12] = -input_matrix(feet[k], position, yaw, mass, inertia, dt)
+        rows[start : start + STATES, forces : forces + 12] = -input_matrix(feet[k], expected[k], yaw, mass, inertia, dt)
         lower[n + start : n + start + STATES] = constant[:, 0]
         upper[n + start : n + start + STATES] = constant[:, 0]
         for leg in range(4):

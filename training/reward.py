@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.robot import Array
-from training.rigid_body import rotation_from_rpy
 
 TABLE_TERMS = ("position", "velocity", "orientation", "angular_velocity", "grf")
 """Table I, row by row."""
@@ -49,10 +48,11 @@ def gaussian_kernel(weight: float, sharpness: float, x: Array, y: Array) -> floa
 
 
 @numba.njit(cache=True)
-def fill_features(position, velocity, rpy, angular_velocity, grf, weight, features):  # type: ignore[no-untyped-def]
-    """Write a tick's state and forces (4, 3) N, with the robot's ``weight`` m g in N, into ``features`` (30,)."""
-    rotation = np.empty((3, 3))
-    rotation_from_rpy(rpy, rotation)
+def fill_features(position, velocity, rotation, angular_velocity, grf, weight, features):  # type: ignore[no-untyped-def]
+    """Write a tick's state and forces (4, 3) N into ``features`` (30,).
+
+    ``rotation`` (3, 3) body to world; ``weight`` m g in N; the rest in the world, forces in the heading frame.
+    """
     for i in range(3):
         features[i] = position[i]
         features[3 + i] = velocity[i]
