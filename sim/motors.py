@@ -86,7 +86,8 @@ class Motors:
 
 
 def _law(command: JointCommand) -> _Law:
-    constant = command.torque + command.kp * command.position + command.kd * command.velocity
+    with np.errstate(invalid="ignore", over="ignore"):
+        constant = command.torque + command.kp * command.position + command.kd * command.velocity
     if not (np.isfinite(constant).all() and np.isfinite(command.kp).all() and np.isfinite(command.kd).all()):
         names = [item.name for item in fields(command) if not np.isfinite(getattr(command, item.name)).all()]
         raise ValueError(f"joint command {', '.join(names) or 'torque'}: not finite")

@@ -138,8 +138,9 @@ def resting_height(terrain: Terrain, feet: Array, radius: float) -> float:
     """
     angles = [index * math.pi / 6 for index in range(12)]
     disc = [(0.0, 0.0), *((r * math.cos(a), r * math.sin(a)) for r in (radius / 2, 0.99 * radius) for a in angles)]
-    return max(
+    rises: list[float] = [
         terrain.height_at(x + dx, y + dy) + math.sqrt(max(radius**2 - dx**2 - dy**2, 0.0)) - z
         for x, y, z in feet.tolist()
         for dx, dy in disc
-    )
+    ]
+    return max(rises)

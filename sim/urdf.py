@@ -15,7 +15,7 @@ import numpy as np
 from drivers.description import RobotDescription, UrdfMap
 from drivers.robot import JOINTS, LEGS, Array
 from sim.errors import UrdfError
-from sim.model import LINKS, Body, Hinge, Model, build_model, lump, standing_pose
+from sim.model import LINKS, Body, Hinge, Model, build_model, lump
 from sim.rotation import about_axis, from_rpy
 
 TOLERANCE = 2e-3
@@ -93,9 +93,8 @@ def check_model(model: Model, path: Path) -> None:
     """
     description = model.description
     primitives = build_model(description)
-    stand = standing_pose(description, description.foot_radius + 0.75 * description.reach - description.hip_position[2])
-    limits = description.joints
-    poses = [stand, np.array(limits.lower), np.array(limits.upper), 0.7 * stand + 0.3 * np.array(limits.upper)]
+    lower, upper = np.array(description.joints.lower), np.array(description.joints.upper)
+    poses = [np.tile([0.0, 0.7, -1.4], (4, 1)), lower, upper, 0.7 * lower + 0.3 * upper]
     for pose in poses:
         difference = np.linalg.norm(model.foot_positions(pose) - primitives.foot_positions(pose), axis=1)
         leg = int(np.argmax(difference))
