@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numba
-
+from runtime.control.compilation import compiled
 from runtime.control.records import Clamp
 
 _COMMAND = int(Clamp.COMMAND)
@@ -13,7 +12,7 @@ HEADING_SLACK = 0.5
 """The commanded heading never leads or trails the body by more, rad: a blocked robot does not wind up."""
 
 
-@numba.njit(cache=True)
+@compiled
 def follow(p, policy, s, t, linear, yaw_rate, standing):  # type: ignore[no-untyped-def]
     """Fill ``velocity_command`` (3,) from the asked ``linear`` (2,) and ``yaw_rate``. Method: Past the teacher 1.
 
@@ -46,7 +45,7 @@ def follow(p, policy, s, t, linear, yaw_rate, standing):  # type: ignore[no-unty
     s.heading = wrapped(t.rpy[2] - error)
 
 
-@numba.njit(cache=True)
+@compiled
 def wrapped(angle):  # type: ignore[no-untyped-def]
     """The same angle in [-pi, pi), rad."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

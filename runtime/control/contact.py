@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from runtime.control.compilation import compiled
 from runtime.control.kinematics import gravity_of_leg
 
 SINGULAR = 1e-5
 """A leg whose Jacobian has a smaller determinant (m³) tells no force."""
 
 
-@numba.njit(cache=True)
+@compiled
 def foot_force(g, leg, q, torque, up, jacobian, force):  # type: ignore[no-untyped-def]
     """Ground on foot of one leg, body frame, N, written into ``force`` (3,): f = -J⁻ᵀ (torque - gravity).
 
@@ -32,11 +32,11 @@ def foot_force(g, leg, q, torque, up, jacobian, force):  # type: ignore[no-untyp
         force[i] *= scale
 
 
-@numba.njit(cache=True)
+@compiled
 def feel_contacts(p, s, t):  # type: ignore[no-untyped-def]
-    """Contact of every foot from the vertical force, with hysteresis, blind early in a swing."""
+    """Contact of every foot from the vertical force, with hysteresis; early in a swing none can begin, only end."""
     for leg in range(4):
         bound = p.contact_release if s.contacts[leg] else p.contact_threshold
-        blind = s.swinging[leg] and t.phase[leg] < p.contact_blanking
+        blind = not s.contacts[leg] and s.swinging[leg] and t.phase[leg] < p.contact_blanking
         s.contacts[leg] = t.contact_force[leg, 2] > bound and not blind
         t.contacts[leg] = s.contacts[leg]

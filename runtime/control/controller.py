@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from drivers.description import RobotDescription
 from drivers.robot import JointCommand, Measurement
 from runtime.control.command import follow
+from runtime.control.compilation import compiled
 from runtime.control.estimator import estimate, times
 from runtime.control.gait import advance_gait
 from runtime.control.grf import GrfProblem, aim_wrench, build_qp, cut_forces, share_forces
@@ -35,7 +35,7 @@ SCRATCH_DTYPE = np.dtype(
 )
 
 
-@numba.njit(cache=True)
+@compiled
 def sense(parameters, geometry, state, record, scratch, orientation, rate, acceleration, position, velocity, torque):  # type: ignore[no-untyped-def]
     """The estimate alone."""
     p, g, s, t, m = parameters[0], geometry[0], state[0], record[0], scratch[0]
@@ -44,7 +44,7 @@ def sense(parameters, geometry, state, record, scratch, orientation, rate, accel
     estimate(p, g, s, t, m.rotation, m.imu, m.joints, m.jacobian)
 
 
-@numba.njit(cache=True)
+@compiled
 def plan(parameters, geometry, policies, state, record, scratch, linear, yaw_rate, standing):  # type: ignore[no-untyped-def]
     """From the estimate to the force problem. Returns its number of legs, -1 where a number is not finite."""
     p, g, policy, s, t, m = parameters[0], geometry[0], policies[0], state[0], record[0], scratch[0]
@@ -59,7 +59,7 @@ def plan(parameters, geometry, policies, state, record, scratch, linear, yaw_rat
     return build_qp(p, t, m.com, m.hessian, m.gradient)
 
 
-@numba.njit(cache=True)
+@compiled
 def carry_out(parameters, geometry, policies, state, record, scratch, force, standing, out):  # type: ignore[no-untyped-def]
     """From the forces to the joint command, written into ``out`` (5, 4, 3)."""
     p, g, s, t, m = parameters[0], geometry[0], state[0], record[0], scratch[0]

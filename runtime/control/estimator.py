@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from runtime.control.compilation import compiled
 from runtime.control.contact import feel_contacts, foot_force
 from runtime.control.kinematics import GRAVITY, foot_of_leg, jacobian_of_leg
 
 
-@numba.njit(cache=True)
+@compiled
 def rotation_from(q, rotation):  # type: ignore[no-untyped-def]
     """Rotation body to world (3, 3) of the quaternion w x y z, normalised."""
     scale = 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -34,21 +34,21 @@ def rotation_from(q, rotation):  # type: ignore[no-untyped-def]
     rotation[2, 2] = 1.0 - scale * (x * x + y * y)
 
 
-@numba.njit(cache=True)
+@compiled
 def times(rotation, vector, out):  # type: ignore[no-untyped-def]
     """Write rotation (3, 3) times vector (3,) into ``out`` (3,)."""
     for i in range(3):
         out[i] = rotation[i, 0] * vector[0] + rotation[i, 1] * vector[1] + rotation[i, 2] * vector[2]
 
 
-@numba.njit(cache=True)
+@compiled
 def transposed_times(rotation, vector, out):  # type: ignore[no-untyped-def]
     """Write rotation transposed times vector (3,) into ``out`` (3,)."""
     for i in range(3):
         out[i] = rotation[0, i] * vector[0] + rotation[1, i] * vector[1] + rotation[2, i] * vector[2]
 
 
-@numba.njit(cache=True)
+@compiled
 def estimate(p, g, s, t, rotation, imu, joints, jacobian):  # type: ignore[no-untyped-def]
     """One tick of contact, filter and height: fills the estimate's fields of the tick record ``t``.
 
@@ -99,7 +99,7 @@ def estimate(p, g, s, t, rotation, imu, joints, jacobian):  # type: ignore[no-un
         t.position[i] = s.position[i]
 
 
-@numba.njit(cache=True)
+@compiled
 def _leg_odometry(g, q, speed, rate, foot, jacobian, to_world, velocity, rolling):  # type: ignore[no-untyped-def]
     """Velocity (3,) that the body has if this foot rolls without slipping, and of the rolling foot's centre, world.
 
@@ -123,7 +123,7 @@ def _leg_odometry(g, q, speed, rate, foot, jacobian, to_world, velocity, rolling
         velocity[i] = rolling[i] - velocity[i]
 
 
-@numba.njit(cache=True)
+@compiled
 def _start(p, s, in_world):  # type: ignore[no-untyped-def]
     s.velocity[:] = 0.0
     s.support[:] = in_world
@@ -132,10 +132,11 @@ def _start(p, s, in_world):  # type: ignore[no-untyped-def]
     for leg in range(4):
         s.covariance[leg + 1, leg + 1] = p.foot_position_noise**2
     s.height = p.walking_height
+    s.rested[:] = p.settling_time
     s.started = 2
 
 
-@numba.njit(cache=True)
+@compiled
 def _predict(p, s, to_world, acceleration, rolling):  # type: ignore[no-untyped-def]
     covariance = s.covariance
     gained = np.empty(3)
@@ -155,12 +156,13 @@ def _predict(p, s, to_world, acceleration, rolling):  # type: ignore[no-untyped-
     covariance[0, 0] += (p.acceleration_noise * p.dt) ** 2
 
 
-@numba.njit(cache=True)
+@compiled
 def _update(p, s, leg, foot, velocity):  # type: ignore[no-untyped-def]
-    """Two scalar updates for a foot in contact; a foot in the air is only where kinematics says."""
+    """Two scalar updates for a foot at rest; one in the air or just landed is only where kinematics says."""
     covariance = s.covariance
     row = leg + 1
-    if not s.contacts[leg]:
+    s.rested[leg] = s.rested[leg] + p.dt if s.contacts[leg] else 0.0
+    if s.rested[leg] <= p.settling_time:
         s.support[leg] = foot
         covariance[row, :] = 0.0
         covariance[:, row] = 0.0
@@ -183,7 +185,7 @@ def _update(p, s, leg, foot, velocity):  # type: ignore[no-untyped-def]
                 covariance[i, k] -= gain[i] * across[k]
 
 
-@numba.njit(cache=True)
+@compiled
 def _height(p, g, s, t):  # type: ignore[no-untyped-def]
     """Low-passed height above the feet in contact; without any, the velocity carries it on."""
     total, count = 0.0, 0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from drivers.robot import Array
+from runtime.control.compilation import compiled
 from runtime.control.parameters import GaitConfig
 
 
@@ -43,7 +43,7 @@ def gait_table(gait: GaitConfig) -> tuple[Array, float, float]:
     return (1.0 - np.array(pattern.begins)) % 1.0, swing_time, stance_time
 
 
-@numba.njit(cache=True)
+@compiled
 def advance_gait(p, s, t, standing):  # type: ignore[no-untyped-def]
     """Move the clock by one tick and decide swing and stance of every leg.
 

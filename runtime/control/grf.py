@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from drivers.robot import Array
+from runtime.control.compilation import compiled
 from runtime.control.kinematics import GRAVITY
 from runtime.control.records import Clamp
 
@@ -53,7 +53,7 @@ def force_bounds(legs: int, friction: float, min_force: float, max_force: float)
     return np.tile([-side, -side, min_force], legs), np.tile([side, side, max_force], legs)
 
 
-@numba.njit(cache=True)
+@compiled
 def aim_wrench(p, policy, t):  # type: ignore[no-untyped-def]
     """Fill ``target_wrench`` (6,): gravity's, the policy's and the centripetal force of the commanded arc."""
     t.target_wrench[:] = t.action[12:]
@@ -63,7 +63,7 @@ def aim_wrench(p, policy, t):  # type: ignore[no-untyped-def]
     t.target_wrench[1] += turn * t.velocity_command[0]
 
 
-@numba.njit(cache=True)
+@compiled
 def build_qp(p, t, com, buffer, gradient):  # type: ignore[no-untyped-def]
     """Write Q and c of this tick's stance legs; ``com`` (3,) is the centre of mass in the heading frame.
 
@@ -106,7 +106,7 @@ def build_qp(p, t, com, buffer, gradient):  # type: ignore[no-untyped-def]
     return legs if finite else -1
 
 
-@numba.njit(cache=True)
+@compiled
 def accept(hessian, gradient, friction, min_force, max_force, force):  # type: ignore[no-untyped-def]
     """Whether ``force`` (3n,) is finite, feasible and optimal within tolerance, whatever its solver says.
 
@@ -138,7 +138,7 @@ def accept(hessian, gradient, friction, min_force, max_force, force):  # type: i
     return True
 
 
-@numba.njit(cache=True)
+@compiled
 def _slope(hessian, gradient, force, row):  # type: ignore[no-untyped-def]
     total = gradient[row]
     for k in range(len(force)):
@@ -146,7 +146,7 @@ def _slope(hessian, gradient, force, row):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True)
+@compiled
 def clipped_least_squares(hessian, gradient, friction, min_force, max_force):  # type: ignore[no-untyped-def]
     """The third resort: the unconstrained minimum (3n,), each leg clipped into its truncated pyramid."""
     force = np.linalg.solve(hessian, -gradient)
@@ -159,7 +159,7 @@ def clipped_least_squares(hessian, gradient, friction, min_force, max_force):  #
     return force
 
 
-@numba.njit(cache=True)
+@compiled
 def share_forces(p, t, force):  # type: ignore[no-untyped-def]
     """Put the solved forces (3n,) on the stance legs and zero on the others; note a force at its bound."""
     index = 0
@@ -174,7 +174,7 @@ def share_forces(p, t, force):  # type: ignore[no-untyped-def]
             index += 1
 
 
-@numba.njit(cache=True)
+@compiled
 def cut_forces(p, t):  # type: ignore[no-untyped-def]
     """The direct variant: forces of the policy plus an equal share of gravity, cut into each leg's pyramid."""
     legs = max(1, t.stance.sum())

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.description import END, SIDE, RobotDescription
 from drivers.robot import Array
+from runtime.control.compilation import compiled
 from runtime.control.records import Records
 
 GRAVITY = 9.81
@@ -64,7 +64,7 @@ def leg_geometry(description: RobotDescription) -> Records:
     return geometry
 
 
-@numba.njit(cache=True)
+@compiled
 def foot_of_leg(g, leg, q, foot):  # type: ignore[no-untyped-def]
     """Foot of one leg from its angles ``q`` (3,), written into ``foot`` (3,), m, body frame."""
     l1 = g.side[leg] * g.abduction_length
@@ -75,7 +75,7 @@ def foot_of_leg(g, leg, q, foot):  # type: ignore[no-untyped-def]
     foot[2] = g.hips[leg, 2] + l1 * math.sin(q[0]) - c * math.cos(q[0])
 
 
-@numba.njit(cache=True)
+@compiled
 def jacobian_of_leg(g, leg, q, jacobian):  # type: ignore[no-untyped-def]
     """d foot / d q of one leg, written into ``jacobian`` (3, 3), body frame."""
     l1 = g.side[leg] * g.abduction_length
@@ -95,7 +95,7 @@ def jacobian_of_leg(g, leg, q, jacobian):  # type: ignore[no-untyped-def]
     jacobian[2, 2] = -shank_x * c1
 
 
-@numba.njit(cache=True)
+@compiled
 def angles_of_leg(g, leg, foot, q):  # type: ignore[no-untyped-def]
     """Angles that put one foot at ``foot`` (3,), written into ``q`` (3,), on the stand branch (knee < 0).
 
@@ -123,12 +123,12 @@ def angles_of_leg(g, leg, foot, q):  # type: ignore[no-untyped-def]
     return reached
 
 
-@numba.njit(cache=True)
+@compiled
 def _wrapped(angle):  # type: ignore[no-untyped-def]
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@numba.njit(cache=True)
+@compiled
 def gravity_of_leg(g, leg, q, up, torque):  # type: ignore[no-untyped-def]
     """Torque that holds one leg's own links against gravity, N·m, written into ``torque`` (3,).
 
@@ -154,7 +154,7 @@ def gravity_of_leg(g, leg, q, up, torque):  # type: ignore[no-untyped-def]
     torque[2] = GRAVITY * knee
 
 
-@numba.njit(cache=True)
+@compiled
 def _all_legs(geometry, values, out, inverse):  # type: ignore[no-untyped-def]
     reached = np.ones(4, np.bool_)
     for leg in range(4):
@@ -165,7 +165,7 @@ def _all_legs(geometry, values, out, inverse):  # type: ignore[no-untyped-def]
     return reached
 
 
-@numba.njit(cache=True)
+@compiled
 def _all_jacobians(geometry, q, out):  # type: ignore[no-untyped-def]
     for leg in range(4):
         jacobian_of_leg(geometry[0], leg, q[leg], out[leg])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from runtime.control.command import wrapped
+from runtime.control.compilation import compiled
 from runtime.control.records import Clamp
 
 OBSERVATION_NAMES = tuple(
@@ -21,7 +21,7 @@ OBSERVATION_NAMES = tuple(
 _OBSERVATION = int(Clamp.OBSERVATION)
 
 
-@numba.njit(cache=True)
+@compiled
 def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
     """Fill ``observation`` (28,) with 14 numbers now and the same 14 one tick ago, scaled.
 

@@ -89,6 +89,8 @@ class EstimatorConfig(Record, frozen=True, kw_only=True):
     """Of the velocity that a stance leg tells, m/s."""
     slip_noise: Positive = 0.01
     """Random walk of a foot in contact, m/√s."""
+    settling_time: NonNegative = 0.01
+    """How long a foot that has just landed is not believed to rest, s."""
     height_time_constant: NonNegative = 0.02
     """Low-pass of the height, s."""
 

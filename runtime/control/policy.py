@@ -8,12 +8,12 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numba
 import numpy as np
 from msgspec import Meta
 
 from drivers.description import NonNegative, Positive, Record, RobotDescription, composite_inertia
 from drivers.robot import LEGS, Array
+from runtime.control.compilation import compiled
 from runtime.control.observation import OBSERVATION_NAMES
 from runtime.control.records import Clamp, Records
 from runtime.control.state import POLICY_DTYPE, stand_angles
@@ -109,7 +109,7 @@ def set_parameters(record: Records, policy: Policy, parameters: Array) -> None:
     r["readout"][:actions, :hidden] = parameters[hidden * 28 :].reshape(actions, hidden)
 
 
-@numba.njit(cache=True)
+@compiled
 def act(p, policy, s, t):  # type: ignore[no-untyped-def]
     """Fill ``asked`` and ``action`` (18,) from the observation; a direct policy's forces go into ``grf`` (4, 3).
 
@@ -148,7 +148,7 @@ def act(p, policy, s, t):  # type: ignore[no-untyped-def]
             t.clamps |= _WRENCH
 
 
-@numba.njit(cache=True)
+@compiled
 def _bound_shifts(p, policy, s, t):  # type: ignore[no-untyped-def]
     follow = p.dt / (p.dt + policy.shift_time_constant)
     for leg in range(4):
@@ -162,7 +162,7 @@ def _bound_shifts(p, policy, s, t):  # type: ignore[no-untyped-def]
                 s.shifts[leg, i] = t.action[a]
 
 
-@numba.njit(cache=True)
+@compiled
 def _bound_forces(p, policy, t, out):  # type: ignore[no-untyped-def]
     """The direct variant: forces about an equal share of gravity's, bounded; the pyramid is cut in ``grf``."""
     t.asked[12:] = 0.0

@@ -26,6 +26,7 @@ STATE_DTYPE = np.dtype(
         ("velocity", "f8", (3,)),  # of the body origin in the world, m/s
         ("support", "f8", (4, 3)),  # feet from the body origin, world axes, m
         ("covariance", "f8", (5, 5)),  # of velocity and four feet, the same for x, y and z
+        ("rested", "f8", (4,)),  # how long each foot has been in contact, s
         ("height", "f8"),
         ("position", "f8", (3,)),
         # command
@@ -85,6 +86,7 @@ PARAMETERS_DTYPE = np.dtype(
         ("foot_position_noise", "f8"),
         ("foot_velocity_noise", "f8"),
         ("slip_noise", "f8"),
+        ("settling_time", "f8"),
         ("height_time_constant", "f8"),
         # grf
         ("friction", "f8"),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from runtime.control.compilation import compiled
 from runtime.control.estimator import transposed_times
 from runtime.control.kinematics import angles_of_leg
 from runtime.control.records import Clamp
@@ -14,7 +14,7 @@ GAIN_RISE = 0.5
 """s over which a leg's gains rise to those of standing."""
 
 
-@numba.njit(cache=True)
+@compiled
 def command_joints(p, g, s, t, rotation, jacobian, standing, out):  # type: ignore[no-untyped-def]
     """Joint targets, gains and feed-forward torque of all legs, into ``t`` and ``out`` (5, 4, 3).
 
@@ -51,7 +51,7 @@ def command_joints(p, g, s, t, rotation, jacobian, standing, out):  # type: igno
     out[3], out[4] = t.command_kd, t.command_torque
 
 
-@numba.njit(cache=True)
+@compiled
 def _schedule_gain(p, s, t, leg, standing):  # type: ignore[no-untyped-def]
     if not t.stance[leg]:
         s.gain_scale[leg] = 1.0

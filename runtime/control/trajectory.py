@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
+from runtime.control.compilation import compiled
 
 
-@numba.njit(cache=True)
+@compiled
 def aim_feet(p, g, s, t):  # type: ignore[no-untyped-def]
     """Fill ``touchdown`` (4, 2) and ``foot_targets`` (4, 3), heading frame from the body origin, m.
 

@@ -1,0 +1,49 @@
+# make run: the robot walks a tour in the simulator.   make test: the suite.   make check: lint, types, contracts.
+# make bench: what the numbers in docs/performance.md come from.
+# Each creates the environment it needs in .venv; PYTHON names the interpreter to make it with.
+
+PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do command -v $$p >/dev/null && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: run test check bench format clean
+
+run: $(VENV)/.sim
+	@$(BIN)/trotd tour
+
+test: $(VENV)/.dev
+	$(BIN)/pytest $(PYTEST_ARGS)
+
+check: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+bench: $(VENV)/.dev
+	@$(BIN)/trotd bench
+
+format: $(VENV)/.dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "trotd needs Python 3.11 or newer: install it, or say make PYTHON=/path/to/python3.11"; exit 2; }
+	@$(PYTHON) -m venv $(VENV) || { echo "no venv module: on Debian, apt install python3-venv"; exit 2; }
+
+$(VENV)/.sim: $(BIN)/python pyproject.toml constraints.txt
+	@$(BIN)/python -c 'import platform, sys; sys.exit(not (sys.version_info < (3, 12) and platform.machine() == "x86_64"))' \
+	  || { echo "the simulator (PyBullet) has wheels for Python 3.11 on x86-64 only: make PYTHON=python3.11 run"; exit 2; }
+	@echo "installing trotd[sim] into $(VENV) (once) ..."
+	@$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[sim]'
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.sim
+	@echo "installing trotd[dev] into $(VENV) (once) ..."
+	@$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

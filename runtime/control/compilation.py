@@ -1,0 +1,53 @@
+"""How the core is compiled: ``@compiled`` is numba's njit with a disk cache that notices every change.
+
+Numba's cache looks at the file of a function, not at those of the functions it calls: after an upgrade that touched
+only an inner room the robot would go on running the old one. So the cache lives in a folder named after the digest of
+all sources that are ever compiled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+_ROOT = Path(__file__).parents[2]
+
+
+def source_digest(package: str) -> str:
+    """Digest of every source file that compiled code of ``package`` may call: its own room's and those below."""
+    below = {"sim": ("sim",), "training": ("sim", "training")}.get(package, ())
+    digest = hashlib.sha256()
+    for room in ("drivers", "runtime/control", *below):
+        for path in sorted((_ROOT / room).glob("*.py")):
+            digest.update(path.name.encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@lru_cache
+def cache_folder(package: str) -> Path:
+    """Where compiled code is kept: ``NUMBA_CACHE_DIR``, the service's cache, or the user's; else a temporary folder."""
+    named = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("CACHE_DIRECTORY")
+    base = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "trotd"
+    folder = base / f"compiled-{source_digest(package)}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="trotd-compiled-"))
+
+
+def compiled(function: _Function) -> _Function:
+    """Compile ``function`` at its first call, or load it from the cache. Divisions by zero give inf, as in numpy."""
+    numba.config.CACHE_DIR = str(cache_folder(function.__module__.partition(".")[0]))
+    return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
