@@ -212,7 +212,7 @@ def load_reference(path: Path, config: Config) -> Reference:
         OSError: not readable.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             head: dict[str, Any] = json.loads(str(file["head"]))
             features, commands = file["features"], file["commands"]
     except (ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
