@@ -94,7 +94,7 @@ class MitCodec:
     fd = False
     running = _RUNNING
     """Modes are named like moteus': 0 disabled, 1 fault, 10 running. A CubeMars motor does not tell: 10."""
-    starting = (_DISABLED,)
+    starting: tuple[int, ...] = (_DISABLED,)
 
     def __init__(self, ids: Sequence[int], *, model: str, host: int = 0) -> None:
         if model not in RANGES:
@@ -110,7 +110,7 @@ class MitCodec:
         self.query = [DISABLE] * len(ids)
         """The only question that energises nothing."""
         self.stop = [DISABLE] * len(ids)
-        self.enable = [ENABLE] * len(ids)
+        self.enable: list[bytes] | None = [ENABLE] * len(ids)
         full = np.array([self.range.position, self.range.velocity, self.range.torque])
         self._low = np.array([*-full, 0.0, 0.0])
         self._high = np.array([*full, KP_MAX, KD_MAX])

@@ -81,7 +81,7 @@ class MoteusCodec:
     fd = True
     running = int(Mode.POSITION)
     """The mode in which a servo obeys; from 0 a command passes through 2, 3 and 4 to it."""
-    starting = (0, 2, 3, 4)
+    starting: tuple[int, ...] = (0, 2, 3, 4)
 
     def __init__(
         self,
@@ -101,6 +101,7 @@ class MoteusCodec:
         self.reply_ids = [reply_id(motor, host) for motor in ids]
         self.query = [pad(_QUERY[form])] * len(ids)
         self.stop = [pad(b"\x01\x00\x00" + _QUERY[form])] * len(ids)
+        self.enable: list[bytes] | None = None
         self.gain_limit = np.array([servo_kp / REVOLUTION, servo_kd / REVOLUTION])
         """Stiffness, N·m/rad, and damping, N·m·s/rad, at scale 1: the most that ``compact`` can ask."""
         self._layout, (self._head1, self._head2, self._head3) = _REPLY[form]
@@ -137,6 +138,9 @@ class MoteusCodec:
             frames["gains"] = np.clip(wire[:, 3:], -_MAX8, _MAX8)
         data, size = bytes(self._buffer), frames.itemsize
         return [data[start : start + size] for start in range(0, len(data), size)]
+
+    def motor_of(self, data: bytes) -> None:
+        """The arbitration id of a reply tells its sender, not the data."""
 
     def decode(self, data: bytes) -> Reading:
         """One reply, in wire units.

@@ -1,0 +1,361 @@
+"""Twelve motors on their buses: one cycle a tick, at the joints' side of gear, sign and offset.
+
+A joint's angle is ``direction · motor / gear − offset``; the gear is what the motor's own report does not yet contain
+(1 where it speaks of its output shaft). A silent motor keeps its last reading, whose age tells.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, Protocol
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from drivers.bus import Bus, Frame
+from drivers.description import PerLeg, Positive, Positive3, Record
+from drivers.errors import CorruptFrame
+from drivers.mit import MitCodec
+from drivers.moteus import Format, MoteusCodec, Reading
+from drivers.robot import JOINTS, LEGS, Array, JointCommand, JointState
+
+Id = Annotated[int, Meta(ge=1, le=126)]
+BusNumber = Annotated[int, Meta(ge=1, le=16)]
+Direction = Literal[-1, 1]
+PerLegIds = tuple[tuple[Id, Id, Id], tuple[Id, Id, Id], tuple[Id, Id, Id], tuple[Id, Id, Id]]
+PerLegBuses = tuple[
+    tuple[BusNumber, BusNumber, BusNumber],
+    tuple[BusNumber, BusNumber, BusNumber],
+    tuple[BusNumber, BusNumber, BusNumber],
+    tuple[BusNumber, BusNumber, BusNumber],
+]
+PerLegDirections = tuple[
+    tuple[Direction, Direction, Direction],
+    tuple[Direction, Direction, Direction],
+    tuple[Direction, Direction, Direction],
+    tuple[Direction, Direction, Direction],
+]
+
+
+class MotorsConfig(Record, frozen=True, kw_only=True):
+    """``[motors]``: which motor moves which joint, and how. Rows FL FR BL BR, columns abduction hip knee."""
+
+    protocol: Literal["moteus", "mit"] = "moteus"
+    id: PerLegIds
+    bus: PerLegBuses
+    """Which of ``[bus] channels``, counted from 1."""
+    direction: PerLegDirections
+    """+1 where the motor turns as the joint does."""
+    offset: PerLeg
+    """rad: joint = direction · motor / gear − offset."""
+    gear: Positive3 = (1.0, 1.0, 1.0)
+    """Turns that the motor reports in one turn of the joint, for abduction, hip, knee."""
+    max_torque: Positive3
+    """Bound sent with every command, N·m at the joint."""
+    watchdog: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.1
+    """s without a command after which a motor goes limp by itself."""
+    servo_kp: Positive = 200.0
+    """moteus: ``servo.pid_position.kp`` that the servos are configured with, N·m per revolution."""
+    servo_kd: Positive = 10.0
+    """moteus: ``servo.pid_position.kd`` that the servos are configured with, N·m per revolution/s."""
+    format: Format = "float"
+    """moteus: ``float``, or ``compact`` for smaller frames with gains up to the servos' own."""
+    model: str = ""
+    """MIT protocol: the motors' model, which tells its ranges."""
+
+
+class MotorCodec(Protocol):
+    """A motors' protocol, sans-I/O; ``MoteusCodec`` and ``MitCodec`` are such."""
+
+    fd: bool
+    running: int
+    starting: tuple[int, ...]
+    command_ids: list[int]
+    reply_ids: list[int]
+    query: list[bytes]
+    stop: list[bytes]
+    enable: list[bytes] | None
+
+    def encode(self, commands: Array) -> list[bytes]:
+        """Frames for position, velocity, torque, kp, kd at the motors (n, 5)."""
+        ...
+
+    def motor_of(self, data: bytes) -> int | None:
+        """The motor that a reply names in its data; None where its arbitration id does."""
+        ...
+
+    def decode(self, data: bytes) -> Reading:
+        """One reply in wire units: mode, position, velocity, torque, voltage, temperature, fault."""
+        ...
+
+    def to_si(self, readings: Array) -> Array:
+        """Rows of ``decode`` in SI units."""
+        ...
+
+    def fault(self, mode: int, fault: int) -> int:
+        """The fault code of a motor that is not running."""
+        ...
+
+    def describe_fault(self, code: int) -> str:
+        """A fault code in words."""
+        ...
+
+
+def build_codec(config: MotorsConfig) -> MotorCodec:
+    """The codec that ``config`` asks for.
+
+    Raises:
+        ValueError: an id, model or bound that the protocol does not have.
+    """
+    ids = [motor for leg in config.id for motor in leg]
+    if config.protocol == "mit":
+        return MitCodec(ids, model=config.model)
+    return MoteusCodec(
+        ids,
+        max_torque=np.tile(np.array(config.max_torque) / config.gear, 4),
+        servo_kp=config.servo_kp,
+        servo_kd=config.servo_kd,
+        watchdog=config.watchdog,
+        form=config.format,
+    )
+
+
+RESTARTED = 16
+"""Fault code of ours: a motor that had been running is back at its beginning. Its zero may be lost."""
+NOT_STARTING = 17
+"""Fault code of ours: a motor that gets commands but does not begin to obey."""
+START_TIME = 0.25
+"""s that a motor may take from stopped to running."""
+
+
+@dataclass(slots=True)
+class MotorCounters:
+    """Replies that were not the one awaited; the bus counts the rest."""
+
+    missed: int = 0
+    """Replies that did not come in their tick."""
+    late: int = 0
+    """Replies to an older tick; used, with their true age."""
+    duplicate: int = 0
+    foreign: int = 0
+    """Frames that are not from a motor of ours: echoes, other devices."""
+    corrupt: int = 0
+
+
+Purpose = Literal["command", "query", "stop"]
+_MODE, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _TEMPERATURE, _FAULT = range(7)
+
+
+class Motors:
+    """The motors of one robot on an open bus."""
+
+    def __init__(
+        self,
+        config: MotorsConfig,
+        bus: Bus,
+        reply_time: float,
+        *,
+        codec: MotorCodec | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.config, self.bus = config, bus
+        self.codec = codec or build_codec(config)
+        self.counters = MotorCounters()
+        self._reply_time, self._clock = reply_time, clock
+        self._bus_of = [number - 1 for leg in config.bus for number in leg]
+        self._ids = [motor for leg in config.id for motor in leg]
+        self._index = _index(self._bus_of, self._ids, self.codec)
+        direction = np.array(config.direction, dtype=np.float64).ravel()
+        gear = np.tile(np.array(config.gear), 4)
+        self._to_joint, self._offset = direction / gear, np.array(config.offset).ravel()
+        self._torque_to_joint = direction * gear
+        self._scale = _command_scale(direction, gear)
+        self._command = np.zeros((12, 5))
+        self._frames: dict[Purpose, list[Frame]] = {
+            "query": self._addressed(self.codec.query),
+            "stop": self._addressed(self.codec.stop),
+        }
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every reading and fault."""
+        self._readings: list[Reading] = [_NOTHING] * 12
+        self._si = np.full((12, 7), np.nan)
+        self._stamps = [-np.inf] * 12
+        self._answered: set[int] = set()
+        self._waiting, self._last_sent = False, -np.inf
+        self._running = [False] * 12
+        self._commanding_since: float | None = None
+        self._latched: dict[int, int] = {}
+
+    async def open(self) -> None:
+        """Open the buses.
+
+        Raises:
+            DriverError: names each bus that could not be opened.
+        """
+        await self.bus.open(self._receive)
+
+    async def close(self) -> None:
+        """Release the buses. Never raises."""
+        await self.bus.close()
+
+    async def query(self) -> None:
+        """Ask all motors how they are; energises nothing."""
+        await self._cycle(self._frames["query"])
+
+    async def stop(self) -> None:
+        """Take the torque from all motors, which also clears what they latched."""
+        self._commanding_since = None
+        self._running = [False] * 12
+        self._latched.clear()
+        await self._cycle(self._frames["stop"])
+
+    async def command(self, command: JointCommand) -> None:
+        """Send one tick's commands and gather the replies.
+
+        Raises:
+            ValueError: a number is not finite; nothing was sent.
+        """
+        if self._commanding_since is None:
+            self._commanding_since = self._clock()
+            if self.codec.enable is not None:
+                await self._cycle(self._addressed(self.codec.enable))
+                return
+        await self._cycle(self._addressed(self.codec.encode(self._at_motors(command))))
+
+    def joint_state(self) -> JointState:
+        """All motors' newest readings, at the joints."""
+        now, si = self._clock(), self._si
+        return JointState(
+            position=(si[:, _POSITION] * self._to_joint - self._offset).reshape(4, 3),
+            velocity=(si[:, _VELOCITY] * self._to_joint).reshape(4, 3),
+            torque=(si[:, _TORQUE] * self._torque_to_joint).reshape(4, 3),
+            temperature=si[:, _TEMPERATURE].reshape(4, 3),
+            fault=self._faults(now).reshape(4, 3),
+            age=(now - np.array(self._stamps)).reshape(4, 3),
+        )
+
+    @property
+    def voltage(self) -> float:
+        """Lowest supply voltage that a motor reports, V; NaN where none reports one."""
+        volts = self._si[:, _VOLTAGE]
+        known = volts[np.isfinite(volts)]
+        return float(known.min()) if len(known) else float("nan")
+
+    @property
+    def modes(self) -> list[int]:
+        """What mode each motor says it is in."""
+        return [int(reading[_MODE]) for reading in self._readings]
+
+    def silent(self, longer_than: float) -> list[int]:
+        """Indices of the motors whose last reply is older than that, s."""
+        now = self._clock()
+        return [index for index, stamp in enumerate(self._stamps) if now - stamp > longer_than]
+
+    def name(self, index: int) -> str:
+        """``FL knee (id 13, bus 1)`` for 2."""
+        return f"{LEGS[index // 3]} {JOINTS[index % 3]} (id {self._ids[index]}, bus {self._bus_of[index] + 1})"
+
+    def describe_fault(self, code: int) -> str:
+        """A fault code of ``joint_state`` in words."""
+        if code == RESTARTED:
+            return "it restarted by itself: check supply and zero"
+        if code == NOT_STARTING:
+            return f"it gets commands but did not begin to obey within {START_TIME} s"
+        return self.codec.describe_fault(code)
+
+    async def _cycle(self, frames: Sequence[Frame]) -> None:
+        self._answered.clear()
+        self._waiting = True
+        self._last_sent = self._clock()
+        await self.bus.cycle(frames, self._reply_time)
+        self._waiting = False
+        self._si = self.codec.to_si(np.array(self._readings))
+        self.counters.missed += 12 - len(self._answered)
+
+    def _receive(self, bus: int, identifier: int, data: bytes) -> bool:
+        counters = self.counters
+        try:
+            motor = self.codec.motor_of(data)
+            index = self._index.get((bus, identifier, motor))
+            if index is None:
+                counters.foreign += 1
+                return False
+            reading = self.codec.decode(data)
+        except CorruptFrame:
+            counters.corrupt += 1
+            return False
+        self._readings[index] = reading
+        if not self._waiting:
+            counters.late += 1
+            self._stamps[index] = self._last_sent
+            return False
+        counters.duplicate += index in self._answered
+        self._answered.add(index)
+        self._stamps[index] = self._clock()
+        return len(self._answered) == 12
+
+    def _at_motors(self, command: JointCommand) -> Array:
+        matrix = self._command
+        matrix[:, 0] = command.position.ravel()
+        matrix[:, 0] += self._offset
+        matrix[:, 1] = command.velocity.ravel()
+        matrix[:, 2] = command.torque.ravel()
+        matrix[:, 3] = command.kp.ravel()
+        matrix[:, 4] = command.kd.ravel()
+        scaled: Array = matrix * self._scale
+        return scaled
+
+    def _addressed(self, data: Sequence[bytes]) -> list[Frame]:
+        return list(zip(self._bus_of, self.codec.command_ids, data, strict=True))
+
+    def _faults(self, now: float) -> NDArray[np.int32]:
+        faults = np.zeros(12, dtype=np.int32)
+        running = self.codec.running
+        for index, reading in enumerate(self._readings):
+            if reading[0] == running and not self._latched:
+                self._running[index] = self._commanding_since is not None
+            else:
+                faults[index] = self._fault(index, int(reading[_MODE]), int(reading[_FAULT]), now)
+        return faults
+
+    def _fault(self, index: int, mode: int, fault: int, now: float) -> int:
+        if index in self._latched:
+            return self._latched[index]
+        if mode == self.codec.running:
+            return 0
+        if mode not in self.codec.starting:
+            return self.codec.fault(mode, fault)
+        if self._commanding_since is None:
+            return 0
+        if self._running[index]:
+            self._latched[index] = RESTARTED
+            return RESTARTED
+        return NOT_STARTING if now - self._commanding_since > START_TIME else 0
+
+
+_NOTHING: Reading = (0, float("nan"), float("nan"), float("nan"), float("nan"), float("nan"), 0)
+
+
+def _index(buses: Sequence[int], ids: Sequence[int], codec: MotorCodec) -> dict[tuple[int, int, int | None], int]:
+    named = codec.motor_of(bytes([ids[0], *bytes(7)])) is not None
+    keys = [
+        (bus, identifier, motor if named else None)
+        for bus, identifier, motor in zip(buses, codec.reply_ids, ids, strict=True)
+    ]
+    index = {key: place for place, key in enumerate(keys)}
+    for place, key in enumerate(keys):
+        if index[key] != place:
+            first, second = (f"{LEGS[i // 3]} {JOINTS[i % 3]}" for i in (place, index[key]))
+            raise ValueError(f"motors: {first} and {second} both have id {ids[place]} on bus {key[0] + 1}")
+    return index
+
+
+def _command_scale(direction: Array, gear: Array) -> Array:
+    """Joint to motor, for position, velocity, torque, kp, kd. Shape (12, 5)."""
+    angle = direction * gear
+    return np.stack([angle, angle, direction / gear, 1.0 / gear**2, 1.0 / gear**2], axis=1)
