@@ -28,7 +28,10 @@ def find_policy(name: str, beside: Path | None = None) -> Path:
         PolicyError: none of these; the message lists the shipped ones.
     """
     file = name if name.endswith(".json") else f"{name}.json"
-    for path in (Path(file), *((beside / file,) if beside else ()), SHIPPED / file):
+    candidates: list[Path] = [Path(file), SHIPPED / file]
+    if beside is not None:
+        candidates.insert(1, beside / file)
+    for path in candidates:
         if path.is_file():
             return path
     known = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.json")))

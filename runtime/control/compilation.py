@@ -13,11 +13,10 @@ import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numba
 
-_Function = TypeVar("_Function", bound=Callable[..., Any])
 _ROOT = Path(__file__).parents[2]
 
 
@@ -47,7 +46,7 @@ def cache_folder(package: str) -> Path:
     return Path(tempfile.mkdtemp(prefix="trotd-compiled-"))
 
 
-def compiled(function: _Function) -> _Function:
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call, or load it from the cache. Divisions by zero give inf, as in numpy."""
-    numba.config.CACHE_DIR = str(cache_folder(function.__module__.partition(".")[0]))
-    return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
+    numba.config.CACHE_DIR = str(cache_folder(function.__module__.partition(".")[0]))  # type: ignore[attr-defined]
+    return cast(Callable[..., Any], numba.njit(cache=True, error_model="numpy")(function))
