@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from drivers.description import RobotDescription
 from drivers.robot import JOINTS, LEGS
+from runtime.control.compilation import compiled
 from runtime.control.records import Clamp, Records
 from runtime.messages import TICK_DTYPE
 from runtime.modes import Reason
@@ -45,7 +45,7 @@ _JOINT_SPEED, _LOW_VOLTAGE, _OVERLOAD, _BAD_COMMAND = (
 _TORQUE = int(Clamp.TORQUE)
 
 
-@numba.njit(cache=True)
+@compiled
 def _judge_imu(t, b):  # type: ignore[no-untyped-def]
     w, x, y, z = t.orientation[0], t.orientation[1], t.orientation[2], t.orientation[3]
     norm = w * w + x * x + y * y + z * z
@@ -66,7 +66,7 @@ def _judge_imu(t, b):  # type: ignore[no-untyped-def]
     return _OK
 
 
-@numba.njit(cache=True)
+@compiled
 def _judge_joint(t, b, leg, joint):  # type: ignore[no-untyped-def]
     position, velocity = t.joint_position[leg, joint], t.joint_velocity[leg, joint]
     torque, temperature = t.joint_torque[leg, joint], t.joint_temperature[leg, joint]
@@ -83,7 +83,7 @@ def _judge_joint(t, b, leg, joint):  # type: ignore[no-untyped-def]
     return _OK
 
 
-@numba.njit(cache=True)
+@compiled
 def judge(ticks, bounds, mean_square):  # type: ignore[no-untyped-def]
     """The first thing wrong with the measurement in ``ticks`` (1,): its reason, and 3·leg + joint or -1.
 
@@ -111,7 +111,7 @@ def judge(ticks, bounds, mean_square):  # type: ignore[no-untyped-def]
     return _OK, -1
 
 
-@numba.njit(cache=True)
+@compiled
 def bound_command(ticks, bounds):  # type: ignore[no-untyped-def]
     """Cut the feed-forward of ``ticks`` (1,) so that the law's foreseen torque stays within the peak.
 

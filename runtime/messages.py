@@ -5,14 +5,39 @@ One numpy record is a tick's telemetry on the wire and its row in the flight log
 
 from __future__ import annotations
 
-from enum import IntEnum
+import math
+from enum import IntEnum, StrEnum
+from typing import TypeVar
 
 import msgspec
 import numpy as np
 
 from runtime.control.records import CONTROL_DTYPE, Clamp, SolverStatus, VelocityCommand
 
-__all__ = ["Clamp", "CONTROL_DTYPE", "Event", "Mode", "SolverStatus", "Status", "TICK_DTYPE", "VelocityCommand"]
+__all__ = [
+    "CONTROL_DTYPE",
+    "TICK_DTYPE",
+    "Clamp",
+    "Event",
+    "Keys",
+    "Mode",
+    "ModeReply",
+    "MessageError",
+    "PolicyReply",
+    "RecordingEntry",
+    "RecordingReply",
+    "Request",
+    "SimPush",
+    "SimTruth",
+    "SolverStatus",
+    "Status",
+    "VelocityCommand",
+    "VelocityMessage",
+    "decode_push",
+    "decode_request",
+    "decode_velocity",
+    "tick_schema",
+]
 
 
 class Mode(IntEnum):
@@ -23,6 +48,17 @@ class Mode(IntEnum):
     STAND = 2
     WALK = 3
     SIT_DOWN = 4
+
+
+class Request(StrEnum):
+    """What the operator may ask for: the words of ``command/mode``."""
+
+    ARM = "arm"
+    STAND = "stand"
+    WALK = "walk"
+    SIT = "sit"
+    DAMP = "damp"
+    CLEAR = "clear"
 
 
 TICK_DTYPE = np.dtype(
@@ -66,6 +102,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     mode: str
     armed: bool
+    fault: str
+    """The fault that stands until it is cleared; empty for none."""
     reason: str
     """Why the mode is what it is, in words."""
     policy: str
@@ -113,6 +151,123 @@ class ModeReply(msgspec.Struct, frozen=True):
     reason: str
 
 
+class PolicyReply(msgspec.Struct, frozen=True):
+    """JSON reply to a candidate sent to ``policy``."""
+
+    accepted: bool
+    name: str
+    """Of the active policy after the answer."""
+    sha256: str
+    """Of the active policy's file."""
+    reason: str
+
+
+class RecordingEntry(msgspec.Struct, frozen=True):
+    """One row of the list that ``recording`` answers with."""
+
+    name: str
+    path: str
+    """On the robot."""
+    size: int
+    """Bytes."""
+
+
+class RecordingReply(msgspec.Struct, frozen=True):
+    """JSON reply to ``recording?write``."""
+
+    accepted: bool
+    path: str
+    reason: str
+
+
+class SimTruth(msgspec.Struct, frozen=True):
+    """JSON on ``sim/truth``, from a simulated body only: what no robot can know."""
+
+    stamp: float
+    """s, the daemon's monotonic clock."""
+    position: tuple[float, float, float]
+    """Of the body origin in the world, m."""
+    rpy: tuple[float, float, float]
+    """rad."""
+    velocity: tuple[float, float, float]
+    """vx, vy in the heading frame, m/s; yaw rate, rad/s."""
+    fallen: bool
+
+
+class SimPush(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """JSON on ``sim/push``, heard by a simulated body only."""
+
+    force: tuple[float, float, float]
+    """N, heading frame, at the body origin."""
+    duration: float
+    """s."""
+
+
+class MessageError(ValueError):
+    """Bytes from the wire that are not what the key carries: the message names the field, the value and the bound."""
+
+
+Message = TypeVar("Message")
+LARGEST_MESSAGE = 4096
+"""Bytes that a velocity, a mode or a push may take at most."""
+LARGEST_PUSH = 5000.0
+"""N; 10 s is the longest."""
+
+
+def _decode(data: bytes, kind: type[Message]) -> Message:
+    if len(data) > LARGEST_MESSAGE:
+        raise MessageError(f"{len(data)} bytes; a message here has at most {LARGEST_MESSAGE}")
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MessageError(str(error)) from error
+
+
+def _within(name: str, value: float, bound: float) -> None:
+    if not (math.isfinite(value) and abs(value) <= bound):
+        raise MessageError(f"{name} = {value}: must be within ±{bound:g}")
+
+
+def decode_velocity(data: bytes, linear: tuple[float, float], yaw_rate: float) -> VelocityMessage:
+    """What ``command/velocity`` carries, within the robot's bounds ``linear`` (m/s) and ``yaw_rate`` (rad/s).
+
+    Raises:
+        MessageError: not JSON, not these two keys, not finite or out of bounds.
+    """
+    message = _decode(data, VelocityMessage)
+    for name, value, bound in zip(("linear[0]", "linear[1]"), message.linear, linear, strict=True):
+        _within(name, value, bound)
+    _within("yaw_rate", message.yaw_rate, yaw_rate)
+    return message
+
+
+def decode_request(data: bytes) -> Request:
+    """What a query on ``command/mode`` carries: one of the words of ``Request``, bare.
+
+    Raises:
+        MessageError: anything else; the message lists the words.
+    """
+    try:
+        return Request(data[:LARGEST_MESSAGE].decode().strip())
+    except ValueError as error:
+        words = ", ".join(request.value for request in Request)
+        raise MessageError(f"mode = {data[:40]!r}: must be one of {words}") from error
+
+
+def decode_push(data: bytes) -> SimPush:
+    """What ``sim/push`` carries.
+
+    Raises:
+        MessageError: not JSON, not these keys, not finite or beyond what makes sense.
+    """
+    message = _decode(data, SimPush)
+    for axis, value in zip("xyz", message.force, strict=True):
+        _within(f"force {axis}", value, LARGEST_PUSH)
+    if not 0.0 < message.duration <= 10.0:
+        raise MessageError(f"duration = {message.duration}: must be in (0, 10]")
+    return message
+
+
 class Keys:
     """The key expressions of one robot."""
 
@@ -127,6 +282,8 @@ class Keys:
         self.policy = f"{root}/policy"
         self.recording = f"{root}/recording"
         self.alive = f"{root}/alive"
+        self.sim_truth = f"{root}/sim/truth"
+        self.sim_push = f"{root}/sim/push"
 
 
 def tick_schema() -> bytes:

@@ -7,21 +7,10 @@ every way into DAMP disarms. A fault stays until ``clear``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntEnum, StrEnum
+from enum import IntEnum
 from typing import assert_never
 
-from runtime.messages import Mode
-
-
-class Request(StrEnum):
-    """What the operator may ask for: the words of ``command/mode``."""
-
-    ARM = "arm"
-    STAND = "stand"
-    WALK = "walk"
-    SIT = "sit"
-    DAMP = "damp"
-    CLEAR = "clear"
+from runtime.messages import Mode, Request
 
 
 class Reason(IntEnum):
@@ -85,7 +74,7 @@ WORDS: dict[Reason, str] = {
     Reason.NOT_ARMED: "not armed: ask for arm first",
     Reason.NOT_STANDING: "not standing: ask for stand first",
     Reason.NOT_DAMPED: "only in damp",
-    Reason.STILL_MOVING: "still standing up or sitting down",
+    Reason.STILL_MOVING: "still moving: wait until it stands or sits",
     Reason.WALKING: "walking: ask for stand first",
     Reason.FAULT_STANDS: "a fault stands: look at it, then ask for clear",
     Reason.NOT_READY: "not ready",
@@ -156,8 +145,16 @@ TABLE: dict[Request, dict[Mode, Entry]] = {
 """Requests that move the robot. The other three do not need a table: arm and clear work in DAMP only, damp always."""
 
 
-def request(state: ModeState, wish: Request, verdict: Reason, ready: bool) -> Answer:
-    """The answer to ``wish`` while the guard says ``verdict`` and the arming checks say ``ready``."""
+def request(state: ModeState, wish: Request, verdict: Reason, ready: bool, settled: bool = True) -> Answer:
+    """The answer to ``wish``.
+
+    Args:
+        state: before it.
+        wish: what the operator asks for.
+        verdict: of the guard, OK or a fault.
+        ready: nothing speaks against arming.
+        settled: all four legs carry; a robot that stands on two of them does not sit down.
+    """
     match wish:
         case Request.DAMP:
             return Answer(_damped(state, Reason.REQUESTED), True, Reason.REQUESTED)
@@ -165,6 +162,8 @@ def request(state: ModeState, wish: Request, verdict: Reason, ready: bool) -> An
             return _clear(state, verdict)
         case Request.ARM:
             return _arm(state, verdict, ready)
+        case Request.SIT if state.mode is Mode.STAND and not settled:
+            return _refused(state, Reason.STILL_MOVING)
         case Request.STAND | Request.WALK | Request.SIT:
             return _move(state, TABLE[wish][state.mode], verdict)
         case _:

@@ -1,4 +1,4 @@
-"""The shell's configuration: what a robot's TOML says outside ``[robot]`` and ``[control]``, every number with its unit.
+"""The shell's configuration: what a robot's TOML says outside ``[robot]`` and ``[control]``, numbers with units.
 
 Every table may be left out: the defaults are those of a robot of Stoch3's size on one host.
 """

@@ -77,14 +77,12 @@ def _mlockall() -> None:
         raise OSError(ctypes.get_errno(), "mlockall")
 
 
-def hold_garbage() -> None:
-    """Collect once, set everything that lives aside, and collect no more: for the time the robot is armed."""
+def settle_garbage() -> None:
+    """Collect once and set everything that lives aside, so that no later collection looks at it: before the loop."""
     gc.collect()
     gc.freeze()
-    gc.disable()
 
 
-def release_garbage() -> None:
-    """Let the collector work again."""
-    gc.unfreeze()
-    gc.enable()
+def hold_garbage(hold: bool) -> None:
+    """Collect no more, while armed; or let the collector work again."""
+    (gc.disable if hold else gc.enable)()

@@ -43,7 +43,7 @@ def timerfd(first: int, period: int) -> int:
         error = ctypes.get_errno()
         os.close(fd)
         raise OSError(error, "timerfd_settime")
-    return fd
+    return int(fd)
 
 
 class Ticker:

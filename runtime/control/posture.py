@@ -15,9 +15,9 @@ import numpy as np
 
 from drivers.description import RobotDescription
 from drivers.robot import Array, JointCommand, Measurement
-from runtime.control.kinematics import GRAVITY, forward, inverse, jacobians
+from runtime.control.kinematics import GRAVITY, forward, inverse, jacobians, leg_geometry
 from runtime.control.parameters import ControlConfig
-from runtime.control.state import build_parameters, leg_geometry
+from runtime.control.state import build_parameters
 
 
 class PostureTimes(Protocol):
@@ -56,7 +56,7 @@ class Segment:
 def minimum_jerk(share: float) -> float:
     """From 0 to 1 with no speed and no acceleration at either end."""
     share = min(1.0, max(0.0, share))
-    return share**3 * (10.0 + share * (6.0 * share - 15.0))
+    return min(1.0, share**3 * (10.0 + share * (6.0 * share - 15.0)))
 
 
 def blend(old: JointCommand, new: JointCommand, share: float) -> JointCommand:
@@ -158,7 +158,8 @@ class Posture:
     def _bear(self, q: Array) -> Array:
         """-Jᵀ f with a quarter of the borne weight on every foot, N·m."""
         force = np.array([0.0, 0.0, 0.25 * self.load * self.weight])
-        return -(jacobians(self.geometry, q).transpose(0, 2, 1) @ force)
+        torque: Array = -(jacobians(self.geometry, q).transpose(0, 2, 1) @ force)
+        return torque
 
     def _begin(self, segments: list[Segment]) -> None:
         self._segments = segments

@@ -1,0 +1,283 @@
+"""One tick between two exchanges: judge → mode → command → bound, all into one record.
+
+Synchronous, without clock or wire: time, measurement and requests come in, one ``JointCommand`` goes out. The daemon
+calls it on the robot, tests and replays call it on anything.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.robot import JointCommand, Measurement, damp_command
+from runtime import modes
+from runtime.config import Config
+from runtime.control.controller import Controller
+from runtime.control.policy import Policy
+from runtime.control.posture import Posture, blend, minimum_jerk
+from runtime.control.records import CONTROL_DTYPE, Clamp, SolverStatus, VelocityCommand
+from runtime.limits import Guard
+from runtime.messages import CONTROL_OFFSET, TICK_DTYPE, Event, Mode, Request
+from runtime.modes import Answer, ModeState, Reason
+
+EVENTS = 256
+"""Events that wait for the link at most; the oldest go first."""
+
+_COMMAND_FIELDS = ("position", "velocity", "kp", "kd", "torque")
+_PLAN_FIELDS = ("velocity_command", "observation", "asked", "action", "phase", "stance", "touchdown", "foot_targets")
+_BLANK_FIELDS = (*_PLAN_FIELDS, "target_wrench", "grf", "solver_status", "clamps")
+
+
+@dataclass(frozen=True, slots=True)
+class Wake:
+    """What the ticker says of the tick that begins."""
+
+    index: int
+    stamp: float
+    """s monotonic."""
+    elapsed: float
+    """Since the tick before, s."""
+    lateness: float
+    """s."""
+    overruns: int
+    """Since the start."""
+
+
+class Cycle:
+    """One robot's mode, its sources of commands and the record of the tick."""
+
+    def __init__(self, config: Config, policy: Policy) -> None:
+        """Build and compile everything that a tick needs.
+
+        Raises:
+            ValueError: a pose or a solver that cannot be.
+        """
+        self.config = config
+        self.tick = np.zeros(1, TICK_DTYPE)
+        """The record of this tick. Shape (1,)."""
+        self.state = ModeState()
+        self.events: deque[Event] = deque(maxlen=EVENTS)
+        """What happened and was not yet told."""
+        self.generation = 1
+        """Number of policies that were active so far."""
+        self.clamps = np.zeros(len(Clamp), np.int64)
+        """How often each clamp acted."""
+        self.solver = np.zeros(len(SolverStatus), np.int64)
+        """How often each solver status came, in ticks that stepped the controller."""
+        control = self.tick.view(np.uint8)[CONTROL_OFFSET:].view(CONTROL_DTYPE)
+        self.controller = Controller(config.robot, config.control, policy, control)
+        self.guard = Guard(config.robot, config.limits, config.control.rate_hz)
+        self.posture = Posture(config.robot, config.control, config.posture)
+        self._damp = damp_command(config.damp.kd)
+        self._command = self._damp
+        self._blend_from = self._damp
+        self._blend_left = 0.0
+        self._velocity = VelocityCommand()
+        self._rest = VelocityCommand()
+        self._verdict = Reason.NOT_READY
+        self._problems: Sequence[str] = ()
+        self._views = {name: self.tick[name][0] for name in TICK_DTYPE.names or () if self.tick[name].ndim > 1}
+
+    @property
+    def policy(self) -> Policy:
+        """The active policy."""
+        return self.controller.policy
+
+    def swap_policy(self, policy: Policy) -> None:
+        """Take another policy, between two ticks."""
+        self.controller.policy = policy
+        self.generation += 1
+        self.note("policy", f"{policy.name} is active")
+
+    def warm_up(self, measurement: Measurement) -> None:
+        """Run every path of a tick once, so that nothing compiles later; leaves the state as it was."""
+        self.guard.reset()
+        self.controller.reset(measurement)
+        for standing in (False, True):
+            self.controller.step(measurement, self._rest, standing)
+        self.posture.stand_up(measurement)
+        self.posture.step()
+        self.posture.reset()
+        self.controller.reset(measurement)
+        self.tick[:] = 0
+
+    def step(self, wake: Wake, measurement: Measurement) -> JointCommand:
+        """From a measurement to the command that acts from the next exchange on."""
+        self._begin(wake)
+        self._note_measurement(measurement)
+        self._verdict = self.guard.judge(self.tick)
+        walk_lost = wake.stamp - self._velocity.stamp > self.config.command.stand_after
+        before = self.state
+        self.state = modes.advance(before, self._verdict, self.posture.finished, walk_lost)
+        self._changed(before, measurement)
+        command = self._bounded(self._source(wake, measurement), measurement)
+        self._note_command(command)
+        return command
+
+    def silent(self, wake: Wake, words: str) -> JointCommand:
+        """A tick whose exchange brought nothing back: damp, and say so."""
+        self._begin(wake)
+        self._verdict = Reason.BODY_SILENT
+        self._fail(Reason.BODY_SILENT, words)
+        self._note_command(self._damp)
+        return self._damp
+
+    def request(self, wish: Request, measurement: Measurement | None) -> tuple[Answer, str]:
+        """Answer the operator between two ticks; the words name every obstacle."""
+        before = self.state
+        problems = self.guard.arming_problems(self.tick) if wish is Request.ARM and measurement is not None else []
+        settled = bool(self._views["stance"].all())
+        answer = modes.request(before, wish, self._verdict, not problems, settled)
+        self.state = answer.state
+        words = answer.reason.words
+        if answer.reason is Reason.NOT_READY:
+            words = "; ".join(problems) or words
+        elif answer.reason.is_fault:
+            words = self.guard.explain(answer.reason, self.tick)
+        if not answer.accepted:
+            self.note("refused", f"{wish.value}: {words}")
+        if measurement is not None:
+            self._changed(before, measurement)
+        return answer, words
+
+    def command_velocity(self, command: VelocityCommand) -> None:
+        """Take the newest velocity command; it counts from its stamp."""
+        self._velocity = command
+
+    def damp(self, reason: Reason) -> None:
+        """Damp and disarm for a reason of the daemon's own."""
+        before = self.state
+        self.state = ModeState(Mode.DAMP, False, reason, before.fault)
+        self._enter(before)
+
+    def note(self, kind: str, text: str) -> None:
+        """Add an event."""
+        tick = self.tick[0]
+        self.events.append(Event(stamp=float(tick["stamp"]), tick=int(tick["index"]), kind=kind, text=text))
+
+    def _begin(self, wake: Wake) -> None:
+        t = self.tick
+        t["index"], t["stamp"], t["period"] = wake.index, wake.stamp, wake.elapsed
+        t["lateness"], t["overruns"], t["policy"] = wake.lateness, wake.overruns, self.generation
+        t["clamps"] = 0
+
+    def _note_measurement(self, measurement: Measurement) -> None:
+        t, views = self.tick, self._views
+        imu, joints = measurement.imu, measurement.joints
+        t["measured_stamp"], t["imu_stamp"], t["voltage"] = measurement.stamp, imu.stamp, measurement.voltage
+        views["orientation"][:] = imu.orientation
+        views["angular_velocity"][:] = imu.angular_velocity
+        views["linear_acceleration"][:] = imu.linear_acceleration
+        views["joint_position"][:] = joints.position
+        views["joint_velocity"][:] = joints.velocity
+        views["joint_torque"][:] = joints.torque
+        views["joint_temperature"][:] = joints.temperature
+        views["joint_fault"][:] = joints.fault
+        views["joint_age"][:] = joints.age
+
+    def _source(self, wake: Wake, measurement: Measurement) -> JointCommand:
+        """This mode's command, before bounds."""
+        match self.state.mode:
+            case Mode.DAMP:
+                if self._verdict is not Reason.NOT_FINITE:
+                    self.controller.estimate(measurement)
+                return self._damp
+            case Mode.STAND_UP | Mode.SIT_DOWN:
+                self.controller.estimate(measurement)
+                return self._blended(self.posture.step())
+            case Mode.STAND:
+                command = self.controller.step(measurement, self._rest, True)
+            case Mode.WALK:
+                command = self.controller.step(measurement, self._fresh_velocity(wake.stamp), False)
+        self.solver[self.tick["solver_status"][0]] += 1
+        return self._blended(command)
+
+    def _fresh_velocity(self, now: float) -> VelocityCommand:
+        """The newest command, or rest once it is too old; the controller bounds how fast it follows."""
+        command = self._velocity
+        if now - command.stamp > self.config.command.expiry:
+            self.tick["clamps"] |= np.uint32(Clamp.EXPIRED)
+            return self._rest
+        return command
+
+    def _blended(self, command: JointCommand) -> JointCommand:
+        if self._blend_left <= 0.0:
+            return command
+        self._blend_left -= 1.0 / self.config.control.rate_hz
+        share = minimum_jerk(1.0 - self._blend_left / self.config.posture.blend_time)
+        return blend(self._blend_from, command, share)
+
+    def _bounded(self, command: JointCommand, measurement: Measurement) -> JointCommand:
+        """The command with its torque cut, or damp when it cannot be trusted."""
+        if self.state.mode is Mode.DAMP:
+            return self._damp
+        if self.state.mode in (Mode.STAND, Mode.WALK) and self.tick["solver_status"][0] == SolverStatus.FAILED:
+            self._fail(Reason.SOLVER_FAILED, Reason.SOLVER_FAILED.words)
+            return self._damp
+        for name in _COMMAND_FIELDS:
+            self._views[f"command_{name}"][:] = getattr(command, name)
+        reason = self.guard.bound(self.tick)
+        if reason is not Reason.OK:
+            self._fail(reason, reason.words)
+            return self._damp
+        torque = self._views["command_torque"].copy()
+        return JointCommand(command.position, command.velocity, command.kp, command.kd, torque)
+
+    def _note_command(self, command: JointCommand) -> None:
+        t = self.tick
+        for name in _COMMAND_FIELDS:
+            self._views[f"command_{name}"][:] = getattr(command, name)
+        t["mode"], t["armed"], t["reason"] = self.state.mode, self.state.armed, self.state.reason
+        walking = self._velocity if self.state.mode is Mode.WALK else self._rest
+        asked = self._views["asked_velocity"]
+        asked[:2], asked[2] = walking.linear, walking.yaw_rate
+        bits = int(t["clamps"][0])
+        if bits:
+            for index in range(len(self.clamps)):
+                self.clamps[index] += bits >> index & 1
+        self._command = command
+
+    def _fail(self, reason: Reason, words: str) -> None:
+        """Damp for ``reason``; an armed robot keeps it as the fault that stands."""
+        before = self.state
+        self.state = modes.advance(before, reason, False, False)
+        if self.state is not before:
+            self.note("fault", words)
+            self._enter(before)
+
+    def _changed(self, before: ModeState, measurement: Measurement) -> None:
+        """Tell of a change of state and make its new mode ready."""
+        if self.state == before:
+            return
+        if self.state.reason.is_fault and self.state.fault is not before.fault:
+            self.note("fault", self.guard.explain(self.state.reason, self.tick))
+        self._enter(before)
+        if self.state.mode is before.mode:
+            return
+        match self.state.mode:
+            case Mode.STAND_UP:
+                self.posture.stand_up(measurement)
+            case Mode.SIT_DOWN:
+                self.posture.sit_down(measurement, bearing=before.mode is Mode.STAND)
+            case Mode.STAND if before.mode is Mode.STAND_UP:
+                self.controller.reset(measurement)
+            case Mode.WALK:
+                self._velocity = VelocityCommand(stamp=float(self.tick["stamp"][0]))
+
+    def _enter(self, before: ModeState) -> None:
+        """What every change of mode or arming does."""
+        state = self.state
+        if state.mode is not before.mode:
+            self.note("mode", f"{before.mode.name} -> {state.mode.name}: {state.reason.words}")
+            self._blend_from, self._blend_left = self._command, self.config.posture.blend_time
+            for name in _BLANK_FIELDS:
+                self.tick[name] = 0
+            if state.mode is Mode.DAMP or before.mode is Mode.DAMP:
+                self._blend_left = 0.0
+            if state.mode is Mode.DAMP:
+                self.posture.reset()
+        elif state.armed != before.armed or state.fault is not before.fault:
+            self.note("mode", f"{state.mode.name}: {state.reason.words}")

@@ -1,0 +1,400 @@
+"""The service: startup → control and link in one TaskGroup → shutdown, and damp on every way out.
+
+Start never moves the robot: the first command that leaves is damp, and only an operator's request changes that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import platform
+import signal
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import BusTimeout, CorruptFrame, DriverError
+from drivers.robot import Measurement, Robot, damp_command
+from runtime import policies, realtime, state
+from runtime.config import Config
+from runtime.control.policy import Policy, encode_policy
+from runtime.control.records import Clamp, SolverStatus, VelocityCommand
+from runtime.cycle import Cycle, Wake
+from runtime.link import Channel, Link
+from runtime.messages import Keys, ModeReply, Request, Status
+from runtime.modes import Reason
+from runtime.recorder import Header, Recorder, layout
+from runtime.systemd import Notifier
+from runtime.ticker import Ticker
+
+log = logging.getLogger("trotd")
+
+DAMP_REPLIES = 3
+"""Exchanges that must come back before a stopping daemon believes that the body damps."""
+VERSIONED = ("trotd", "numpy", "numba", "daqp", "msgspec", "eclipse-zenoh")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What a daemon is to do: everything that the front door decided."""
+
+    config: Config
+    robot_toml: str
+    """The text that ``config`` was read from."""
+    policy: Policy
+    body: Robot
+    folder: Path
+    """State folder: lock, kept policy, recordings."""
+    channels: Callable[[Keys], Sequence[Channel]] = field(default=lambda _keys: ())
+    """Keys that belong to this body alone."""
+    ready: Callable[[], None] = field(default=lambda: None)
+    """Called once the first tick is about to begin."""
+
+
+class Daemon:
+    """One robot's service, from ``run`` to its return."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.config = job.config
+        self.cycle = Cycle(job.config, job.policy)
+        self.measurement: Measurement | None = None
+        """The last one that came back."""
+        recorder = job.config.recorder
+        self.recorder = Recorder(
+            job.folder / "recordings" / job.config.robot.name,
+            job.config.control.rate_hz,
+            recorder.seconds,
+            recorder.max_files,
+            recorder.max_bytes,
+        )
+        self.recordings: list[Path] = []
+        """Written by this daemon."""
+        self._policy_bytes = encode_policy(job.policy)
+        self._policy_file = job.folder / "policies" / f"{job.config.robot.name}.json"
+        self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
+        self._stop: asyncio.Event | None = None
+        self._writes: deque[tuple[int, str, Future[Path] | None]] = deque()
+        self._held = False
+
+    async def run(self) -> None:
+        """Serve until a signal or ``stop``.
+
+        Raises:
+            AlreadyRunning, LinkError, DriverError, RealtimeError: it could not start.
+            ExceptionGroup: what broke the loop, after the body was damped.
+        """
+        self._stop = asyncio.Event()
+        notifier = Notifier()
+        with state.lock(self.job.folder, self.config.robot.name), contextlib.closing(notifier):
+            async with self._connected(), self._linked():
+                with self._signals():
+                    await self._serve(notifier)
+
+    def stop(self) -> None:
+        """End the loop after this tick."""
+        if self._stop is not None:
+            self._stop.set()
+
+    # Life --------------------------------------------------------------------------------------------------------
+
+    @contextlib.asynccontextmanager
+    async def _connected(self) -> AsyncIterator[None]:
+        body = self.job.body
+        try:
+            await body.connect()
+            self._load_kept_policy()
+            self.measurement = await body.exchange(damp_command(self.config.damp.kd))
+            self.cycle.warm_up(self.measurement)
+            yield
+        finally:
+            try:
+                await self._damp_body()
+            finally:
+                await body.close()
+
+    @contextlib.asynccontextmanager
+    async def _linked(self) -> AsyncIterator[None]:
+        keys = Keys(self.config.robot.name)
+        config = self.config
+        self.link = Link(
+            config.link,
+            config.control.bounds,
+            config.robot.name,
+            config.control.rate_hz,
+            self,
+            self.recorder.folder,
+            self.job.channels(keys),
+        )
+        try:
+            self.link.open()
+            yield
+        finally:
+            self.link.close()
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[None]:
+        """SIGTERM and SIGINT stop; a second one cancels whatever the stop waits for."""
+        loop = asyncio.get_running_loop()
+        task = asyncio.current_task()
+        assert task is not None
+
+        def stop(name: str) -> None:
+            assert self._stop is not None
+            if self._stop.is_set():
+                log.warning("%s again: not waiting any longer", name)
+                task.cancel()
+            else:
+                log.info("%s: stopping", name)
+                self._stop.set()
+
+        caught = (signal.SIGTERM, signal.SIGINT)
+        for number in caught:
+            loop.add_signal_handler(number, stop, number.name)
+        try:
+            yield
+        finally:
+            for number in caught:
+                loop.remove_signal_handler(number)
+
+    async def _serve(self, notifier: Notifier) -> None:
+        for granted in realtime.apply(self.config.realtime):
+            (log.info if granted.granted else log.warning)("%s", granted)
+            self.cycle.note("realtime", str(granted))
+        try:
+            async with asyncio.TaskGroup() as group:
+                sender = group.create_task(self.link.run(), name="link")
+                writer = group.create_task(self._write_recordings(), name="recordings")
+                await self._control(notifier)
+                sender.cancel()
+                writer.cancel()
+        finally:
+            notifier.tell("STOPPING=1")
+            self._hold_garbage(False)
+            self._finish()
+
+    async def _control(self, notifier: Notifier) -> None:
+        """The loop: one exchange and one step of the cycle a tick."""
+        assert self._stop is not None
+        stop, cycle, body, recorder, link = self._stop, self.cycle, self.job.body, self.recorder, self.link
+        feed_every = max(1, round(notifier.watchdog_period * self.config.control.rate_hz))
+        command = damp_command(self.config.damp.kd)
+        realtime.settle_garbage()
+        with Ticker(self.config.control.rate_hz) as ticker:
+            self.job.ready()
+            notifier.tell("READY=1")
+            while not stop.is_set():
+                index = await ticker.wait()
+                wake = Wake(index, ticker.stamp, ticker.elapsed, ticker.lateness, ticker.overruns)
+                try:
+                    self.measurement = measurement = await body.exchange(command)
+                except (BusTimeout, CorruptFrame) as error:
+                    command = cycle.silent(wake, str(error))
+                else:
+                    command = cycle.step(wake, measurement)
+                compute = time.monotonic() - ticker.stamp
+                cycle.tick["compute"] = compute
+                self._compute[recorder.count % len(self._compute)] = compute
+                recorder.keep(cycle.tick)
+                link.offer(cycle.tick)
+                if cycle.events:
+                    self._tell_events()
+                if self._writes and self._writes[0][0] <= recorder.count:
+                    self._write_due.set()
+                if notifier.watchdog_period and index % feed_every == 0:
+                    notifier.tell("WATCHDOG=1")
+
+    async def _damp_body(self) -> None:
+        """Ask the body to damp until it has answered a few times or the deadline is up. Never raises."""
+        config = self.config.damp
+        command = damp_command(config.kd)
+        replies = 0
+        period = 1.0 / self.config.control.rate_hz
+        with contextlib.suppress(asyncio.CancelledError, TimeoutError):
+            async with asyncio.timeout(config.deadline):
+                while replies < DAMP_REPLIES:
+                    try:
+                        await self.job.body.exchange(command)
+                        replies += 1
+                    except DriverError as error:
+                        log.error("while damping: %s", error)
+                    await asyncio.sleep(period)
+        if replies == 0:
+            log.error("the body did not confirm that it damps; its own watchdog has to")
+
+    def _finish(self) -> None:
+        """The loop is over: say so, keep the recording."""
+        self.cycle.damp(Reason.STOPPING)
+        self._tell_events()
+        for _, _, done in self._writes:
+            if done is not None:
+                done.set_exception(OSError("the daemon is stopping"))
+        self._writes.clear()
+        try:
+            if self.recorder.count:
+                self._write("stop")
+        except OSError as error:
+            log.error("recording: %s", error)
+        self._tell_events()
+        self.link.flush()
+
+    # What happens between ticks ----------------------------------------------------------------------------------
+
+    def _tell_events(self) -> None:
+        while self.cycle.events:
+            event = self.cycle.events.popleft()
+            self.recorder.events.append(event)
+            self.link.tell(event)
+            log.info("%s: %s", event.kind, event.text)
+            if event.kind == "fault":
+                after = round(self.config.recorder.after_fault * self.config.control.rate_hz)
+                self._writes.append((self.recorder.count + after, "fault", None))
+        if self.config.realtime.freeze_garbage:
+            self._hold_garbage(self.cycle.state.armed)
+
+    def _hold_garbage(self, hold: bool) -> None:
+        if hold != self._held:
+            self._held = hold
+            realtime.hold_garbage(hold)
+
+    async def _write_recordings(self) -> None:
+        self._write_due = asyncio.Event()
+        while True:
+            await self._write_due.wait()
+            self._write_due.clear()
+            while self._writes and self._writes[0][0] <= self.recorder.count:
+                _, reason, done = self._writes.popleft()
+                try:
+                    path = await asyncio.to_thread(self._write, reason)
+                except OSError as error:
+                    self.cycle.note("recording", f"not written: {error}")
+                    if done is not None:
+                        done.set_exception(error)
+                else:
+                    if done is not None:
+                        done.set_result(path)
+
+    def _write(self, reason: str) -> Path:
+        now = time.time()
+        stamp = time.strftime("%Y%m%dT%H%M%S", time.localtime(now)) + f"-{int(now * 1000) % 1000:03d}"
+        header = Header(
+            robot=self.config.robot.name,
+            robot_toml=self.job.robot_toml,
+            policy=self._policy_bytes.decode(),
+            rate_hz=self.config.control.rate_hz,
+            reason=reason,
+            written=time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(now)),
+            versions=versions(),
+            layout=layout(),
+            itemsize=self.cycle.tick.dtype.itemsize,
+            events=list(self.recorder.events),
+        )
+        path = self.recorder.write(header, f"{stamp}-{reason.replace(' ', '-')}")
+        self.recordings.append(path)
+        self.cycle.note("recording", f"{reason}: {path}")
+        return path
+
+    def _load_kept_policy(self) -> None:
+        """The last policy that was sent and accepted, if it still can be used."""
+        if not self._policy_file.is_file():
+            return
+        try:
+            data = self._policy_file.read_bytes()
+            policy = policies.decode(data, self.config.robot.name, str(self._policy_file))
+        except (OSError, policies.PolicyError) as error:
+            self.cycle.note("policy", f"kept policy not used: {error}")
+            return
+        self.take_policy(policy, data)
+
+    # Doors (on the loop's thread, but for keep_policy) -------------------------------------------------------------
+
+    def take_velocity(self, command: VelocityCommand) -> None:
+        """The newest command of the operator."""
+        self.cycle.command_velocity(command)
+
+    def take_request(self, wish: Request) -> ModeReply:
+        """An operator's wish, answered at once."""
+        answer, words = self.cycle.request(wish, self.measurement)
+        self._tell_events()
+        return ModeReply(answer.accepted, answer.state.mode.name, words)
+
+    def take_policy(self, policy: Policy, data: bytes) -> None:
+        """Make a verified policy the active one."""
+        self.cycle.swap_policy(policy)
+        self._policy_bytes = data
+
+    def keep_policy(self, data: bytes) -> None:
+        """Remember a policy for the next start. On zenoh's thread: it waits for the disk."""
+        state.write_whole(self._policy_file, data)
+
+    def active_policy(self) -> tuple[str, bytes]:
+        """Name and file of the active policy."""
+        return self.cycle.policy.name, self._policy_bytes
+
+    def refuse(self, door: str, why: str) -> None:
+        """A message that did not come through a door."""
+        self.cycle.note("refused", f"{door}: {why}")
+
+    def record_now(self, reason: str, done: Future[Path]) -> None:
+        """Write a recording with the next tick."""
+        self._writes.appendleft((self.recorder.count, reason, done))
+
+    def status(self) -> Status:
+        """Everything that people want to see."""
+        cycle = self.cycle
+        tick, current = cycle.tick[0], cycle.state
+        seen = self._compute[: min(len(self._compute), max(1, self.recorder.count))]
+        p50, p99 = np.percentile(seen, (50, 99))
+        return Status(
+            robot=self.config.robot.name,
+            mode=current.mode.name,
+            armed=current.armed,
+            fault="" if current.fault is Reason.OK else current.fault.words,
+            reason=current.reason.words,
+            policy=f"{cycle.policy.name} {hashlib.sha256(self._policy_bytes).hexdigest()[:12]}",
+            rate_hz=self.config.control.rate_hz,
+            ticks=int(tick["index"]),
+            overruns=int(tick["overruns"]),
+            velocity_command=_triple(tick["asked_velocity"]),
+            velocity=_triple(tick["twist"][[0, 1, 5]]),
+            height=float(tick["height"]),
+            rpy=_triple(tick["rpy"]),
+            voltage=float(tick["voltage"]),
+            max_temperature=float(tick["joint_temperature"].max()),
+            tick_p50=float(p50),
+            tick_p99=float(p99),
+            clamps={str(clamp.name): int(n) for clamp, n in zip(Clamp, cycle.clamps, strict=True) if n},
+            solver={status.name: int(n) for status, n in zip(SolverStatus, cycle.solver, strict=True) if n},
+        )
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def versions() -> dict[str, str]:
+    """What a replay must have been run with."""
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in VERSIONED:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+def main(job: Job) -> Daemon:
+    """Run a daemon on uvloop until it is stopped, and return it."""
+    import uvloop
+
+    daemon = Daemon(job)
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(daemon.run())
+    return daemon
