@@ -280,16 +280,11 @@ class World:
         self._joints = [index[name] for name in JOINT_NAMES]
         self._payload = index[PAYLOAD]
         self._foot_of_link = {self._joints[3 * leg + 2]: leg for leg in range(4)}
-        for link in range(-1, count):
-            bullet.changeDynamics(
-                self._robot,
-                link,
-                linearDamping=0.0,
-                angularDamping=0.0,
-                lateralFriction=1.0,
-                maxJointVelocity=1e3,
-                physicsClientId=client,
-            )
+        bullet.changeDynamics(
+            self._robot, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e3, physicsClientId=client
+        )
+        for link in range(-1, count):  # in a call of its own: beside a damping, PyBullet drops a link's friction
+            bullet.changeDynamics(self._robot, link, lateralFriction=1.0, physicsClientId=client)
         bullet.setJointMotorControlArray(
             self._robot, self._joints, bullet.VELOCITY_CONTROL, forces=[0.0] * 12, physicsClientId=client
         )
