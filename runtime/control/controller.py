@@ -53,7 +53,7 @@ def plan(parameters, geometry, policies, state, record, scratch, linear, yaw_rat
     observe(p, policy, s, t)
     act(p, policy, s, t)
     advance_gait(p, s, t, standing)
-    aim_feet(p, g, s, t)
+    aim_feet(p, g, policy, s, t)
     aim_wrench(p, policy, t)
     times(m.rotation, p.com, m.com)
     return build_qp(p, t, m.com, m.hessian, m.gradient)

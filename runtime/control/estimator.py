@@ -17,6 +17,9 @@ from runtime.control.compilation import compiled
 from runtime.control.contact import feel_contacts, foot_force
 from runtime.control.kinematics import GRAVITY, foot_of_leg, jacobian_of_leg
 
+STEEPEST = 0.4
+"""Bound of the estimated slope, rise over run."""
+
 
 @compiled
 def rotation_from(q, rotation):  # type: ignore[no-untyped-def]
@@ -90,6 +93,7 @@ def estimate(p, g, s, t, rotation, imu, joints, jacobian):  # type: ignore[no-un
     for leg in range(4):
         _update(p, s, leg, in_world[leg], odometry[leg])
     _height(p, g, s, t)
+    _slope(p, s, t, c, sn)
     t.twist[0] = c * s.velocity[0] + sn * s.velocity[1]
     t.twist[1] = -sn * s.velocity[0] + c * s.velocity[1]
     t.twist[2] = s.velocity[2]
@@ -133,6 +137,9 @@ def _start(p, s, in_world):  # type: ignore[no-untyped-def]
         s.covariance[leg + 1, leg + 1] = p.foot_position_noise**2
     s.height = p.walking_height
     s.rested[:] = p.settling_time
+    for leg in range(4):
+        for i in range(3):
+            s.footholds[leg, i] = s.position[i] + in_world[leg, i]
     s.started = 2
 
 
@@ -183,6 +190,32 @@ def _update(p, s, leg, foot, velocity):  # type: ignore[no-untyped-def]
         for i in range(5):
             for k in range(5):
                 covariance[i, k] -= gain[i] * across[k]
+
+
+@compiled
+def _slope(p, s, t, c, sn):  # type: ignore[no-untyped-def]
+    """Low-passed gradient of the plane through the last foothold of every foot, heading frame."""
+    xx, xy, yy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
+    middle = np.zeros(3)
+    for leg in range(4):
+        if s.rested[leg] > p.settling_time:
+            for i in range(3):
+                s.footholds[leg, i] = s.position[i] + s.support[leg, i]
+        for i in range(3):
+            middle[i] += 0.25 * s.footholds[leg, i]
+    for leg in range(4):
+        dx, dy = s.footholds[leg, 0] - middle[0], s.footholds[leg, 1] - middle[1]
+        dz = s.footholds[leg, 2] - middle[2]
+        x, y = c * dx + sn * dy, c * dy - sn * dx
+        xx, xy, yy, xz, yz = xx + x * x, xy + x * y, yy + y * y, xz + x * dz, yz + y * dz
+    determinant = xx * yy - xy * xy
+    follow = p.dt / (p.dt + p.slope_time_constant)
+    if determinant > 0.01 * (xx + yy) ** 2:
+        for i in range(2):
+            raw = (yy * xz - xy * yz) / determinant if i == 0 else (xx * yz - xy * xz) / determinant
+            raw = min(STEEPEST, max(-STEEPEST, raw))
+            s.slope[i] += (raw - s.slope[i]) * follow
+    t.slope[0], t.slope[1] = s.slope[0], s.slope[1]
 
 
 @compiled

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from runtime.control.command import wrapped
@@ -37,6 +39,8 @@ def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
         now[10 + leg] = t.contacts[leg]
     if policy.relative:
         now[0] -= p.walking_height
+        now[1] -= policy.slope_body * math.atan(t.slope[1])
+        now[2] += policy.slope_body * math.atan(t.slope[0])
         now[3] = wrapped(t.rpy[2] - s.heading)
         now[9] -= s.followed[2]
         for i in range(2):

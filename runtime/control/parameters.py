@@ -91,6 +91,8 @@ class EstimatorConfig(Record, frozen=True, kw_only=True):
     """Random walk of a foot in contact, m/√s."""
     settling_time: NonNegative = 0.01
     """How long a foot that has just landed is not believed to rest, s."""
+    slope_time_constant: NonNegative = 0.2
+    """Low-pass of the ground's slope, s."""
     height_time_constant: NonNegative = 0.02
     """Low-pass of the height, s."""
 

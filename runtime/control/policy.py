@@ -42,6 +42,10 @@ class Terms(Record, frozen=True, kw_only=True):
     """Bound of the velocity error in the observation, m/s; 0 for none."""
     centripetal: NonNegative = 0.0
     """Share of m ω x v of the commanded motion that is fed forward."""
+    slope_feet: NonNegative = 0.0
+    """Share of the ground's estimated slope that the foot targets follow."""
+    slope_body: NonNegative = 0.0
+    """Share of it that the wanted roll and pitch follow (relative reading)."""
 
 
 class Policy(Record, frozen=True, kw_only=True):
@@ -211,7 +215,21 @@ def balance_policy(description: RobotDescription, walking_height: float, terms: 
     )
 
 
-BALANCE_TERMS = Terms(velocity_integral=1.5, capture_point=0.13, velocity_error_bound=0.35, centripetal=1.0)
+BALANCE_TERMS = Terms(
+    velocity_integral=1.5,
+    capture_point=0.13,
+    velocity_error_bound=0.35,
+    centripetal=1.0,
+    slope_feet=1.0,
+    slope_body=1.0,
+)
+    velocity_integral=1.5,
+    capture_point=0.13,
+    velocity_error_bound=0.35,
+    centripetal=1.0,
+    slope_feet=1.0,
+    slope_body=0.5,
+)
 
 
 def default_action_scale(description: RobotDescription) -> tuple[Array, Array]:

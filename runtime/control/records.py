@@ -80,6 +80,7 @@ ESTIMATE_FIELDS: Fields = [
     ("contacts", "u1", (4,)),  # 1 where the foot feels the ground
     ("contact_force", "f8", (4, 3)),  # ground on foot from joint torque, heading frame, N
     ("feet", "f8", (4, 3)),  # foot centres from the body origin, heading frame, m
+    ("slope", "f8", (2,)),  # rise of the ground forward and to the left, heading frame
     ("position", "f8", (3,)),  # dead-reckoned body position in the world, m (drifts; for the eye only)
 ]
 POLICY_FIELDS: Fields = [

@@ -43,15 +43,16 @@ class DaqpSolver:
         """See ``GrfSolver``. ``sense`` is cleared each time, so the result is a pure function of the problem."""
         n = len(problem.gradient)
         bounds = (problem.friction, problem.min_force, problem.max_force)
-        known = self._models.get(n)
+        known = self._models.pop(n, None)  # put back on success alone: whatever went wrong may have left it broken
         if known is None or known[0] != bounds:
-            known = self._models[n] = (bounds, self._setup(problem), np.zeros(n + PYRAMID_ROWS * n // 3, np.int32))
+            known = (bounds, self._setup(problem), np.zeros(n + PYRAMID_ROWS * n // 3, np.int32))
         _, model, sense = known
-        model.update(H=problem.hessian, f=problem.gradient, sense=sense)
+        if model.update(H=problem.hessian, f=problem.gradient, sense=sense) < 0:
+            return None
         force, _, exitflag, _ = model.solve()
         if exitflag != 1:
-            del self._models[n]
             return None
+        self._models[n] = known
         return force  # type: ignore[no-any-return]
 
     def _setup(self, problem: GrfProblem) -> Any:
@@ -84,16 +85,16 @@ class ProxqpSolver:
         """See ``GrfSolver``. The object is rebuilt after anything but success: one NaN would poison it for ever."""
         n = len(problem.gradient)
         bounds = (problem.friction, problem.min_force, problem.max_force)
-        known = self._problems.get(n)
+        known = self._problems.pop(n, None)
         if known is None or known[0] != bounds:
-            known = self._problems[n] = (bounds, self._setup(problem))
+            known = (bounds, self._setup(problem))
         else:
             known[1].update(H=problem.hessian, g=problem.gradient)
         qp = known[1]
         qp.solve()
         if qp.results.info.status != self._proxqp.PROXQP_SOLVED:
-            del self._problems[n]
             return None
+        self._problems[n] = known
         return np.array(qp.results.x)
 
     def _setup(self, problem: GrfProblem) -> Any:
@@ -109,7 +110,8 @@ class ProxqpSolver:
         qp.settings.eps_rel = 0.0
         qp.settings.eps_primal_inf = 1e-12
         qp.settings.eps_dual_inf = 1e-12
-        qp.settings.max_iter = 200
+        qp.settings.max_iter = 50
+        qp.settings.max_iter_in = 20  # the default 1500 took a second over one NaN
         qp.settings.initial_guess = self._proxqp.InitialGuess.NO_INITIAL_GUESS
         qp.init(problem.hessian, problem.gradient, None, None, rows, lower, upper)
         return qp

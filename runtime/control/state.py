@@ -29,6 +29,8 @@ STATE_DTYPE = np.dtype(
         ("rested", "f8", (4,)),  # how long each foot has been in contact, s
         ("height", "f8"),
         ("position", "f8", (3,)),
+        ("footholds", "f8", (4, 3)),  # where each foot last rested, dead-reckoned world, m
+        ("slope", "f8", (2,)),
         # command
         ("followed", "f8", (3,)),  # velocity command after its acceleration bound
         ("integral", "f8", (2,)),  # m/s added to the command
@@ -87,6 +89,7 @@ PARAMETERS_DTYPE = np.dtype(
         ("foot_velocity_noise", "f8"),
         ("slip_noise", "f8"),
         ("settling_time", "f8"),
+        ("slope_time_constant", "f8"),
         ("height_time_constant", "f8"),
         # grf
         ("friction", "f8"),
@@ -119,6 +122,8 @@ POLICY_DTYPE = np.dtype(
         ("capture_point", "f8"),
         ("velocity_error_bound", "f8"),
         ("centripetal", "f8"),
+        ("slope_feet", "f8"),
+        ("slope_body", "f8"),
         ("matrix", "f8", (24, 28)),
         ("hidden", "f8", (HIDDEN, 28)),
         ("readout", "f8", (24, HIDDEN)),

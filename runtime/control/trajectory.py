@@ -8,7 +8,7 @@ from runtime.control.compilation import compiled
 
 
 @compiled
-def aim_feet(p, g, s, t):  # type: ignore[no-untyped-def]
+def aim_feet(p, g, policy, s, t):  # type: ignore[no-untyped-def]
     """Fill ``touchdown`` (4, 2) and ``foot_targets`` (4, 3), heading frame from the body origin, m.
 
     Swing covers the remaining way in the remaining time; stance moves against the commanded velocity at the foot. The
@@ -39,4 +39,5 @@ def aim_feet(p, g, s, t):  # type: ignore[no-untyped-def]
             s.depth[leg] = min(p.search_depth, s.depth[leg] + p.search_speed * p.dt) if s.searching[leg] else 0.0
             target[2] = ground - s.depth[leg]
         t.foot_targets[leg, 0], t.foot_targets[leg, 1] = target[0], target[1]
-        t.foot_targets[leg, 2] = target[2] + t.action[3 * leg + 2]
+        rise = policy.slope_feet * (t.slope[0] * target[0] + t.slope[1] * target[1])
+        t.foot_targets[leg, 2] = target[2] + rise + t.action[3 * leg + 2]
