@@ -132,7 +132,8 @@ def gravity_torque(name: str, position: np.ndarray, up: Any) -> np.ndarray:
 
 def potential(name: str, position: np.ndarray, up: Any) -> float:
     """Energy of the legs' links in gravity, J, from the simulator's rigid bodies."""
-    from sim.model import axis_rotation, build_model
+    from sim.model import build_model
+    from sim.rotation import about_axis
 
     model = build_model(robot(name).robot)
     energy = 0.0
@@ -141,7 +142,7 @@ def potential(name: str, position: np.ndarray, up: Any) -> float:
         for joint in range(3):
             hinge, body = model.hinges[3 * leg + joint], model.bodies[1 + 3 * leg + joint]
             origin = origin + turned @ hinge.origin
-            turned = turned @ hinge.rotation @ axis_rotation(hinge.axis, position[leg, joint])
+            turned = turned @ hinge.rotation @ about_axis(hinge.axis, position[leg, joint])
             energy += body.mass * 9.81 * float(np.asarray(up) @ (origin + turned @ body.com))
     return energy
 
