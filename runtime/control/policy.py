@@ -223,13 +223,6 @@ BALANCE_TERMS = Terms(
     slope_feet=1.0,
     slope_body=1.0,
 )
-    velocity_integral=1.5,
-    capture_point=0.13,
-    velocity_error_bound=0.35,
-    centripetal=1.0,
-    slope_feet=1.0,
-    slope_body=0.5,
-)
 
 
 def default_action_scale(description: RobotDescription) -> tuple[Array, Array]:

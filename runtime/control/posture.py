@@ -90,6 +90,8 @@ class Posture:
         hip = description.hip_position[2]
         self.standing = self._feet(footholds, description.foot_radius - control.gait.walking_height)
         self.folded = self._feet(footholds, hip - times.fold_height * description.reach)
+        self.folded_joints, _ = inverse(self.geometry, self.folded)
+        """Where standing up begins and sitting down ends, rad. Shape (4, 3)."""
         for name, feet in (("control.gait.walking_height", self.standing), ("posture.fold_height", self.folded)):
             self._check(description, name, feet)
         self.reset()
@@ -113,11 +115,10 @@ class Posture:
         if self.load > 0.0:
             self._begin([self._along_feet(times.rise_time, feet, self.standing, 1.0)])
             return
-        folded, _ = inverse(self.geometry, self.folded)
         self._begin(
             [
                 Segment(times.soft_start, q, q, False, (self.gain, 1.0), (0.0, 0.0)),
-                Segment(times.fold_time, q, folded, False, (1.0, 1.0), (0.0, 0.0)),
+                Segment(times.fold_time, q, self.folded_joints, False, (1.0, 1.0), (0.0, 0.0)),
                 Segment(times.settle_time, self.folded, self.folded, True, (1.0, 1.0), (0.0, 1.0)),
                 Segment(times.rise_time, self.folded, self.standing, True, (1.0, 1.0), (1.0, 1.0)),
                 Segment(times.settle_time, self.standing, self.standing, True, (1.0, 1.0), (1.0, 1.0)),
