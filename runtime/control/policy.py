@@ -5,6 +5,7 @@ The file form is ``runtime.policies``; here is the record that the core computes
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -207,8 +208,8 @@ def balance_policy(description: RobotDescription, walking_height: float, terms: 
         observation_names=OBSERVATION_NAMES,
         action_names=SHIFT_NAMES + WRENCH_NAMES,
         observation_scale=tuple(observation_scale.tolist()),
-        action_scale=tuple(action_scale.tolist()),
-        action_bound=tuple(action_bound.tolist()),
+        action_scale=tuple(action_scale.round(4).tolist()),
+        action_bound=tuple(action_bound.round(4).tolist()),
         terms=terms or BALANCE_TERMS,
         matrix=tuple(tuple(row) for row in matrix.round(6).tolist()),
         provenance={"made": "by hand: trotd policy balance"},
@@ -235,19 +236,13 @@ def default_action_scale(description: RobotDescription) -> tuple[Array, Array]:
 
 
 def encode_policy(policy: Policy) -> bytes:
-    """The policy as its file: one line a row, so that people can read and compare it."""
+    """The policy as its file: every row of numbers or names on one line, so that people can read and compare it."""
     text = msgspec.json.format(msgspec.json.encode(policy), indent=1).decode()
-    lines: list[str] = []
-    row: list[str] | None = None
-    for line in text.splitlines():
-        stripped = line.strip()
-        if row is None and stripped.startswith("[") and len(line) - len(stripped) >= 2:
-            row = [line]
-        elif row is not None:
-            row.append(stripped)
-            if stripped in ("]", "],"):
-                lines.append(row[0] + " ".join(row[1:-1]) + row[-1])
-                row = None
-        else:
-            lines.append(line)
-    return ("\n".join(lines) + "\n").encode()
+    return (_INNERMOST.sub(lambda match: _one_line(match[0]), text) + "\n").encode()
+
+
+_INNERMOST = re.compile(r"\[[^\[\]{}]*\]")
+
+
+def _one_line(block: str) -> str:
+    return " ".join(block.split()).replace("[ ", "[").replace(" ]", "]")
