@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,6 +25,11 @@ class Push:
     """N in the world frame."""
     point: Vector = (0.0, 0.0, 0.0)
     """Where it acts, from the body's origin in the body frame, m."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.duration < math.inf:
+            raise ValueError(f"push duration = {self.duration}: must be finite and positive")
+        _check_finite(self, "push", ("start", "force", "point"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +95,15 @@ class Scenario:
 
     def __post_init__(self) -> None:
         for name in ("friction", "payload", "motor_strength", "extra_delay"):
-            if not 0 <= getattr(self, name) < float("inf"):
+            if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"scenario {name} = {getattr(self, name)}: must be finite and not negative")
+        _check_finite(self, "scenario", ("position_xy", "rpy", "velocity") + (("height",) if self.height else ()))
         pose = self.joint_position
         if pose is not None and (pose.shape != (4, 3) or not np.isfinite(pose).all()):
             raise ValueError(f"scenario joint_position of shape {pose.shape}: must be (4, 3) and finite")
+
+
+def _check_finite(record: Push | Scenario, kind: str, names: tuple[str, ...]) -> None:
+    for name in names:
+        if not np.isfinite(getattr(record, name)).all():
+            raise ValueError(f"{kind} {name} = {getattr(record, name)}: must be finite")

@@ -78,11 +78,15 @@ class World:
         self._urdf = self._model.urdf()
         self._built: Terrain | None = None
         self._client = -1
-        with silenced():
-            self._client = self._bullet.connect(self._bullet.DIRECT)
-            self._start(Scenario())
-        self._check_inertia()
-        self.reset(Scenario())
+        try:
+            with silenced():
+                self._client = self._bullet.connect(self._bullet.DIRECT)
+                self._start(Scenario())
+            self._check_inertia()
+            self.reset(Scenario())
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def time(self) -> float:
@@ -135,8 +139,14 @@ class World:
         return measurement
 
     def push(self, force: tuple[float, float, float], duration: float) -> None:
-        """Push the body at its origin from now on: N in the world frame, s."""
-        self._pushes.append(Push(self.time, duration, force))
+        """Push the body at its origin from now on: N in the world frame, s.
+
+        Raises:
+            ValueError: a number that is not finite, or a duration that is not positive.
+        """
+        now = self.time
+        self._pushes = [push for push in self._pushes if push.start + push.duration > now]
+        self._pushes.append(Push(now, duration, force))
 
     def fallen(self, tilt: float = 1.0) -> bool:
         """Whether the body touches the ground or leans by more than ``tilt`` rad."""
@@ -348,7 +358,6 @@ class World:
             inertia = self._bullet.getDynamicsInfo(self._robot, link, physicsClientId=self._client)[2]
             if min(inertia) <= 0.0:
                 name = body.name
-                self.close()
                 raise PhysicsError(
                     f"link {name}: PyBullet turned its inertia into {inertia}; it breaks the triangle rule"
                 )

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
 from drivers.robot import Measurement
 from runtime.config import ROBOTS, load
 from sim.rotation import from_rpy, from_xyzw, to_quaternion
-from sim.scenario import Noise, Scenario
+from sim.scenario import Noise, Push, Scenario
 from sim.sensors import AMBIENT, RISE, WARMING_TIME, Sensors
+from sim.terrain import HeightField
 
 LIMITS = load(ROBOTS / "stoch3.toml").robot.joints
 ROTATION = from_rpy((0.3, -0.2, 1.0))
@@ -115,3 +118,14 @@ def test_an_impossible_scenario_is_refused_by_name(name: str, value: float) -> N
 def test_a_pose_of_another_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \(12,\)"):
         Scenario(joint_position=np.zeros(12))
+
+
+@pytest.mark.parametrize("change", [{"rpy": (0.0, np.nan, 0.0)}, {"height": np.inf}, {"velocity": (np.inf, 0.0, 0.0)}])
+def test_a_scenario_that_is_not_finite_is_refused_by_name(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=f"scenario {next(iter(change))} = .*: must be finite"):
+        Scenario(**change)  # type: ignore[arg-type]
+
+
+def test_a_scenario_travels_to_a_worker_process() -> None:
+    scenario = Scenario(terrain=HeightField(0.05, extent=4.0), pushes=(Push(0.1, 0.2, (1.0, 0.0, 0.0)),), seed=3)
+    assert pickle.loads(pickle.dumps(scenario)) == scenario

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pybullet
 import pytest
 
+import sim
 from drivers.robot import JointCommand, damp_command
 from runtime.config import ROBOTS, load
 from sim.errors import PhysicsError, SimulatorMissing
@@ -314,7 +318,7 @@ def test_feet_rest_on_the_height_that_the_terrain_names(world: World, terrain: T
     touching = 0
     rpy = along(terrain) if isinstance(terrain, Slope) else (0.0, 0.0, 0.0)
     for x, y in ((0.0, 0.0), (0.33, -0.21)):
-        truth = stand(world, Scenario(terrain=terrain, rpy=rpy, position_xy=(x, y), friction=1.2), 2.5)
+        truth = stand(world, Scenario(terrain=terrain, rpy=rpy, position_xy=(x, y), friction=1.2), 2.0)
         rotation = truth.rotation_body_to_world
         feet = truth.position + world.model.foot_positions(truth.joint_position) @ rotation.T
         for foot, contact, force in zip(feet, truth.foot_contacts, truth.foot_forces, strict=True):
@@ -465,6 +469,35 @@ def test_nothing_is_printed() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")
+
+
+def test_only_one_file_speaks_pybullet() -> None:
+    speakers = [
+        path.name
+        for path in Path(sim.__file__).parent.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        and any(
+            name.startswith("pybullet") for name in [getattr(node, "module", "") or "", *(a.name for a in node.names)]
+        )
+    ]
+    assert speakers == ["world.py"]
+
+
+@pytest.mark.parametrize(
+    ("force", "duration", "message"),
+    [
+        ((math.nan, 0.0, 0.0), 0.1, "push force"),
+        ((1.0, 0.0, 0.0), 0.0, "push duration = 0.0"),
+        ((1.0, 0.0, 0.0), math.inf, "push duration = inf"),
+    ],
+)
+def test_an_impossible_push_is_refused_by_name(
+    world: World, force: tuple[float, float, float], duration: float, message: str
+) -> None:
+    world.reset(FLIGHT)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        world.push(force, duration)
 
 
 def test_the_payload_is_a_link_of_its_own(world: World) -> None:
