@@ -1,4 +1,4 @@
-"""What carries frames between this computer and the motors: the interface, its settings and counters, one in-process.
+"""What carries frames between this computer and the motors: the interface, its counters, one in-process.
 
 A back-end carries frames ``(bus, arbitration id, data)``, buses counted from 0. Each tick is one ``cycle``: all frames
 out, then replies handed to ``receive`` as they come, until it says that it has all or the time is up. The wires are in
@@ -9,32 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol
-
-from msgspec import Meta
-
-from drivers.description import Positive, Record
+from typing import Protocol
 
 Frame = tuple[int, int, bytes]
 """Bus (from 0), arbitration id, data."""
 Receive = Callable[[int, int, bytes], bool]
 """Takes one frame; true when no more are awaited."""
-
-
-class BusConfig(Record, frozen=True, kw_only=True):
-    """``[bus]``: the wires between this computer and the motors."""
-
-    backend: Literal["pi3hat", "socketcan", "udp_multicast", "virtual"]
-    channels: Annotated[tuple[str, ...], Meta(min_length=1, max_length=16)]
-    """One name a bus: ``JC1`` (pi3hat), ``can0`` (socketcan), an IPv4 group (udp_multicast), any (virtual)."""
-    reply_timeout: Annotated[float, Meta(gt=0, le=0.1)] = 0.003
-    """How long a tick waits for the replies, s."""
-    port: Annotated[int, Meta(ge=1024, le=65535)] = 43113
-    """UDP port of the first bus of udp_multicast; the others follow, since a host hears all groups of a port."""
-    cpu: Annotated[int, Meta(ge=0, le=63)] = 3
-    """The core that the pi3hat's thread occupies."""
-    reopen_interval: Positive = 0.5
-    """How often a bus that went away is opened anew, s."""
 
 
 @dataclass(slots=True)

@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from drivers.bus import BusConfig, BusCounters, Frame, Receive, nobody
+from drivers.bus import BusCounters, Frame, Receive, nobody
 from drivers.errors import DriverError
+from drivers.wiring import BusConfig
 
 STANDARD_ID_MAX = 0x7FF
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,8 @@ from numpy.typing import NDArray
 from drivers.errors import CorruptFrame
 from drivers.moteus_registers import READ_ERRORS, Mode, describe_fault, pad, parse
 from drivers.robot import Array
+from drivers.wiring import Format
 
-Format = Literal["float", "compact"]
 Reading = tuple[float, float, float, float, float, float, float]
 """mode, position, velocity, torque, voltage, temperature, fault in wire units; ``MoteusCodec.to_si`` makes them SI."""
 

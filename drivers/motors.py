@@ -9,62 +9,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from drivers.bus import Bus, Frame
-from drivers.description import PerLeg, Positive, Positive3, Record
 from drivers.errors import CorruptFrame
 from drivers.mit import MitCodec
-from drivers.moteus import Format, MoteusCodec, Reading
+from drivers.moteus import MoteusCodec, Reading
 from drivers.robot import JOINTS, LEGS, Array, JointCommand, JointState
-
-Id = Annotated[int, Meta(ge=1, le=126)]
-BusNumber = Annotated[int, Meta(ge=1, le=16)]
-Direction = Literal[-1, 1]
-PerLegIds = tuple[tuple[Id, Id, Id], tuple[Id, Id, Id], tuple[Id, Id, Id], tuple[Id, Id, Id]]
-PerLegBuses = tuple[
-    tuple[BusNumber, BusNumber, BusNumber],
-    tuple[BusNumber, BusNumber, BusNumber],
-    tuple[BusNumber, BusNumber, BusNumber],
-    tuple[BusNumber, BusNumber, BusNumber],
-]
-PerLegDirections = tuple[
-    tuple[Direction, Direction, Direction],
-    tuple[Direction, Direction, Direction],
-    tuple[Direction, Direction, Direction],
-    tuple[Direction, Direction, Direction],
-]
-
-
-class MotorsConfig(Record, frozen=True, kw_only=True):
-    """``[motors]``: which motor moves which joint, and how. Rows FL FR BL BR, columns abduction hip knee."""
-
-    protocol: Literal["moteus", "mit"] = "moteus"
-    id: PerLegIds
-    bus: PerLegBuses
-    """Which of ``[bus] channels``, counted from 1."""
-    direction: PerLegDirections
-    """+1 where the motor turns as the joint does."""
-    offset: PerLeg
-    """rad: joint = direction · motor / gear − offset."""
-    gear: Positive3 = (1.0, 1.0, 1.0)
-    """Turns that the motor reports in one turn of the joint, for abduction, hip, knee."""
-    max_torque: Positive3
-    """Bound sent with every command, N·m at the joint."""
-    watchdog: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.1
-    """s without a command after which a motor goes limp by itself."""
-    servo_kp: Positive = 200.0
-    """moteus: ``servo.pid_position.kp`` that the servos are configured with, N·m per revolution."""
-    servo_kd: Positive = 10.0
-    """moteus: ``servo.pid_position.kd`` that the servos are configured with, N·m per revolution/s."""
-    format: Format = "float"
-    """moteus: ``float``, or ``compact`` for smaller frames with gains up to the servos' own."""
-    model: str = ""
-    """MIT protocol: the motors' model, which tells its ranges."""
+from drivers.wiring import MotorsConfig
 
 
 class MotorCodec(Protocol):
@@ -208,10 +163,9 @@ class Motors:
         await self._cycle(self._frames["query"])
 
     async def stop(self) -> None:
-        """Take the torque from all motors, which also clears what they latched."""
+        """Take the torque from all motors, which also clears the faults that they hold; ours stay until ``reset``."""
         self._commanding_since = None
         self._running = [False] * 12
-        self._latched.clear()
         await self._cycle(self._frames["stop"])
 
     async def command(self, command: JointCommand) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivers.robot import Array
-
-Quaternion = tuple[float, float, float, float]
+from drivers.wiring import Quaternion
 
 
 class Mounting:

@@ -11,8 +11,9 @@ import importlib
 from collections.abc import Sequence
 from typing import Any
 
-from drivers.bus import BusConfig, BusCounters, Frame, Receive
+from drivers.bus import BusCounters, Frame, Receive
 from drivers.errors import DriverError
+from drivers.wiring import BusConfig
 
 PORTS = {f"JC{port}": port for port in range(1, 6)}
 SPI_SPEED_HZ = 10_000_000

@@ -14,44 +14,26 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta
 
 from drivers import xbus
 from drivers.attitude import AttitudeFilter
-from drivers.description import Positive, Record
 from drivers.device_clock import DeviceClock
 from drivers.errors import CorruptFrame, DriverError, NotConnected
-from drivers.mounting import Mounting, Quaternion
+from drivers.mounting import Mounting
 from drivers.mtdata2 import STATUS_CLIPPING, STATUS_SELF_TEST, Data, Sample, SampleDecoder
 from drivers.robot import Array, ImuSample
+from drivers.wiring import ImuConfig
 from drivers.xbus import BAUD_CODES, ERRORS, Message, Output
 from drivers.xbus_link import Port, XbusLink, open_port
 
-Baud = Literal[115200, 230400, 460800, 921600, 2000000, 3500000, 4000000]
 WITH_EVERY_PACKET = 0xFFFF
 SILENCE = 0.25
 """s without a sample after which the device is started anew."""
 FIRST_SAMPLE_TIME = 0.5
 _DATA_OVERFLOW = 41
 _TICKS_PER_SECOND, _TICK_BITS = 10_000, 32
-
-
-class ImuConfig(Record, frozen=True, kw_only=True):
-    """``[imu]``: an Xsens MTi."""
-
-    port: str = "/dev/xsens"
-    baud: Baud = 921600
-    rate_hz: Annotated[int, Meta(ge=10, le=400)] = 400
-    """A divisor of 400."""
-    mount: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """w x y z that turns the sensor's axes into the body's; the calibration file has the last word."""
-    set_options: Annotated[int, Meta(ge=0)] = 0
-    """Option flags to set (low-level protocol manual, SetOptionFlags); 0: as stored in the device."""
-    clear_options: Annotated[int, Meta(ge=0)] = 0
-    reopen_interval: Positive = 0.5
 
 
 @dataclass(slots=True)

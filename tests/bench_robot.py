@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from drivers.bus import Frame, InProcessBus
-from drivers.motors import Motors, MotorsConfig
+from drivers.motors import Motors
 from drivers.robot import JointCommand
+from drivers.wiring import MotorsConfig
 from sim.mit_emulator import MitEmulator
 from sim.moteus_emulator import MoteusEmulator
 from sim.servo import Drive, ServoEmulator

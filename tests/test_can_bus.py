@@ -13,10 +13,11 @@ import can
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
-from drivers.bus import BusConfig, BusCounters
+from drivers.bus import BusCounters
 from drivers.can_bus import PythonCanBus, SocketCanChannel, open_channel
 from drivers.errors import DriverError
 from drivers.pi3hat import Pi3HatBus, load_library
+from drivers.wiring import BusConfig
 
 
 def config(backend: str = "virtual", *channels: str, **changes: object) -> BusConfig:

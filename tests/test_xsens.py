@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from drivers.errors import DriverError, NotConnected
-from drivers.xsens import ImuConfig, Xsens
+from drivers.wiring import ImuConfig
+from drivers.xsens import Xsens
 from sim.serial_imu import SerialImu
 
 STILL = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 9.81]))
