@@ -241,7 +241,7 @@ class World:
         """Put robot and ground where ``scenario`` wants them, with nothing of the last episode left.
 
         On level and tilted planes PyBullet's own state ends with one step far from the ground, so the bodies are kept;
-        elsewhere its broad phase remembers the past in the order of its pairs, so everything is built anew.
+        elsewhere its broad phase drops stale pairs a few a step, in an order the past decides, so all is built anew.
         """
         bullet, client = self._bullet, self._client
         if scenario.terrain != self._built or not isinstance(scenario.terrain, Plane | Slope):
