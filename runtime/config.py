@@ -94,6 +94,22 @@ def parse(table: dict[str, Any], place: str) -> Config:
     return config
 
 
+def override(config: Config, place: str, changes: dict[str, Any]) -> Config:
+    """``config`` with dotted keys replaced, such as ``{"control.rate_hz": 500.0}``, checked like a file.
+
+    Raises:
+        ConfigError: as ``parse``, naming ``place``.
+    """
+    table = msgspec.to_builtins(config)
+    for key, value in changes.items():
+        *path, last = key.split(".")
+        target = table
+        for part in path:
+            target = target[part]
+        target[last] = value
+    return parse(table, place)
+
+
 def _contradictions(config: Config) -> Iterator[str]:
     """Pairs of numbers that are each in their bounds but cannot both be true."""
     joints, grf, limits = config.robot.joints, config.control.grf, config.limits

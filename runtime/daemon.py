@@ -95,8 +95,8 @@ class Daemon:
         self._stop = asyncio.Event()
         notifier = Notifier()
         with state.lock(self.job.folder, self.config.robot.name), contextlib.closing(notifier):
-            async with self._connected(), self._linked():
-                with self._signals():
+            with self._signals():
+                async with self._connected(), self._linked():
                     await self._serve(notifier)
 
     def stop(self) -> None:

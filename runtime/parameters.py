@@ -10,7 +10,6 @@ from typing import Annotated
 from msgspec import Meta
 
 from drivers.description import NonNegative, Positive, Record
-from runtime.control.parameters import Fraction
 
 Angle = Annotated[float, Meta(gt=0, le=3.2)]
 Endpoint = Annotated[str, Meta(pattern=r"^[a-z]+/[^\s/]+$")]
@@ -124,9 +123,13 @@ class TourConfig(Record, frozen=True, kw_only=True):
 
     speed_scale: Annotated[float, Meta(gt=0, le=3)] = 1.0
     """Stretches every commanded linear speed of the tour."""
-    push: NonNegative = 100.0
-    """Force of each of the two pushes, N."""
+    push_speed: NonNegative = 0.5
+    """Impulse of each of the two pushes per mass of the robot, m/s."""
     push_time: Annotated[float, Meta(gt=0, le=1)] = 0.1
     """s."""
-    velocity_bound: Fraction = 0.25
-    """Largest RMSE of vx and vy that passes, m/s."""
+    velocity_bound: Positive = 0.10
+    """Largest RMSE of the velocity that passes, m/s."""
+    yaw_rate_bound: Positive = 0.15
+    """Largest error of the mean yaw rate that passes, rad/s."""
+    tilt_bound: Angle = 0.35
+    """Largest roll or pitch that passes, rad."""

@@ -1,0 +1,214 @@
+"""``trotd``: the front door. One thin function a subcommand; each imports only the rooms that it needs.
+
+Exit codes: 0 done, 1 it failed, 2 bad input.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")  # before numpy loads: small matrices are 80 times slower on two threads
+
+import contextlib
+import logging
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from runtime.config import Config
+
+FAILED, BAD_INPUT = 1, 2
+
+app = typer.Typer(
+    name="trotd",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    help="""Runtime service for force-controlled quadrupeds.
+
+**See it walk** (simulated, needs nothing else): `trotd tour`
+
+**Drive it yourself**: `trotd run --body sim` in one terminal, then in another
+`trotd arm`, `trotd stand`, `trotd walk`, velocities as JSON on `trotd/<robot>/command/velocity`,
+`trotd sit`, and `trotd damp` at any moment.
+
+The daemon never moves the robot by itself: it starts in DAMP and waits to be armed.
+Exit codes: 0 done, 1 it failed, 2 bad input.""",
+)
+
+RobotOption = Annotated[str, typer.Option("--robot", "-r", help="A shipped robot's name, or a .toml file.")]
+RateOption = Annotated[float | None, typer.Option("--rate-hz", help="Ticks a second, instead of the robot's own.")]
+ConnectOption = Annotated[str, typer.Option("--connect", help="Endpoint of the daemon.", metavar="ENDPOINT")]
+StateOption = Annotated[
+    Path | None, typer.Option("--state", help="Folder of lock, kept policy and recordings.", file_okay=False)
+]
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+@contextlib.contextmanager
+def _one_line_errors() -> Iterator[None]:
+    """Bad input ends with one line and code 2; what the robot or the link refuses with one line and code 1."""
+    from drivers.errors import DriverError
+    from runtime.config import ConfigError
+    from runtime.link import LinkError
+    from runtime.policies import PolicyError
+    from runtime.realtime import RealtimeError
+    from runtime.state import AlreadyRunning
+    from station.session import StationError
+    from trotd.bodies import BodyError
+
+    try:
+        yield
+    except (ConfigError, PolicyError, BodyError, LinkError, AlreadyRunning, RealtimeError, ImportError) as error:
+        _leave(error, BAD_INPUT)
+    except (DriverError, StationError, OSError) as error:
+        _leave(error, FAILED)
+
+
+def _leave(error: Exception, code: int) -> None:
+    typer.echo(f"trotd: {' '.join(str(error).split())}", err=True)
+    raise typer.Exit(code) from error
+
+
+def _load(robot: str, rate_hz: float | None, listen: list[str] | None) -> tuple[Config, Path]:
+    from runtime import config
+
+    path = config.find_robot(robot)
+    changes: dict[str, object] = {}
+    if rate_hz is not None:
+        changes["control.rate_hz"] = rate_hz
+    if listen:
+        changes["link.listen"] = listen
+    return config.override(config.load(path), "command line", changes), path
+
+
+@app.command()
+def run(
+    robot: RobotOption = "stoch3",
+    body: Annotated[str, typer.Option(help="sim: the simulator. null: no physics at all.")] = "sim",
+    rate_hz: RateOption = None,
+    policy: Annotated[str | None, typer.Option(help="A policy file or a shipped one's name.")] = None,
+    listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on; may be given again.")] = None,
+    folder: StateOption = None,
+) -> None:
+    """Serve one robot in the foreground until SIGTERM or Ctrl-C; damps it on every way out.
+
+    Example: `trotd run --body sim --robot my.toml --rate-hz 500`
+    """
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    with _one_line_errors():
+        from runtime import daemon, policies
+        from runtime.state import state_folder
+        from trotd.bodies import build_body
+
+        config, path = _load(robot, rate_hz, listen)
+        chosen = policies.load(policies.find_policy(policy or config.control.policy, path.parent), config.robot.name)
+        part = build_body(body, config, path)
+        job = daemon.Job(
+            config, path.read_text(), chosen, part.robot, folder or state_folder(), part.channels, _say_ready
+        )
+        for written in daemon.main(job).recordings:
+            typer.echo(f"recording: {written}")
+
+
+def _say_ready() -> None:
+    logging.getLogger("trotd").info("ready: in DAMP, waiting to be armed")
+
+
+@app.command()
+def tour(
+    robot: RobotOption = "stoch3",
+    rate_hz: RateOption = None,
+    json: Annotated[bool, typer.Option("--json", help="The report as JSON, for machines.")] = False,
+    policy: Annotated[str | None, typer.Option(help="A policy file or a shipped one's name.")] = None,
+    folder: StateOption = None,
+) -> None:
+    """Start a daemon on the simulated body, drive it through everything it can do, and report how well it did.
+
+    Exit code 1 if it fell or missed a bound. Under 90 s.
+    """
+    with _one_line_errors():
+        from trotd.tour import take_tour
+
+        config, path = _load(robot, rate_hz, None)
+        arguments = ["--robot", str(path), "--rate-hz", str(config.control.rate_hz)]
+        arguments += ["--policy", policy] if policy else []
+        arguments += ["--state", str(folder)] if folder else []
+        if not take_tour(config, arguments, json):
+            raise typer.Exit(FAILED)
+
+
+@app.command()
+def status(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """Print the robot's next status as JSON."""
+    with _one_line_errors():
+        import msgspec
+
+        from station.session import connected
+
+        config, _ = _load(robot, None, None)
+        with connected(config.robot.name, connect) as station:
+            typer.echo(msgspec.json.format(msgspec.json.encode(station.next_status())))
+
+
+def _request(word: str, robot: str, connect: str) -> None:
+    with _one_line_errors():
+        from runtime.messages import ModeReply
+        from station.session import connected
+
+        config, _ = _load(robot, None, None)
+        with connected(config.robot.name, connect) as station:
+            reply = station.ask_for(ModeReply, station.keys.mode, word.encode())
+        typer.echo(f"{reply.mode}: {reply.reason}" if reply.accepted else f"refused in {reply.mode}: {reply.reason}")
+        if not reply.accepted:
+            raise typer.Exit(FAILED)
+
+
+@app.command()
+def arm(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """Let the robot leave DAMP, if nothing speaks against it; says what does."""
+    _request("arm", robot, connect)
+
+
+@app.command()
+def stand(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """Stand up from DAMP, or stop walking."""
+    _request("stand", robot, connect)
+
+
+@app.command()
+def walk(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """Follow velocity commands; stands again when they stop coming."""
+    _request("walk", robot, connect)
+
+
+@app.command()
+def sit(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """Sit down and damp."""
+    _request("sit", robot, connect)
+
+
+@app.command()
+def damp(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """Damp at once, from anything, and disarm. A standing robot sinks."""
+    _request("damp", robot, connect)
+
+
+@app.command()
+def clear(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """Acknowledge a fault, so that the robot can be armed again."""
+    _request("clear", robot, connect)
+
+
+def main() -> None:
+    """The console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

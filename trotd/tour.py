@@ -1,0 +1,153 @@
+"""``trotd tour``: the daemon in a child process, the client in this one, the report on the screen."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import IO
+
+import msgspec
+from rich.console import Console
+from rich.status import Status as Line
+from rich.table import Table
+
+from runtime.config import Config
+from runtime.messages import Status
+from station.session import Station, StationError, connected
+from station.tour import Tour, TourReport
+
+START_TIMEOUT = 180.0
+"""s; the first start of all compiles the core."""
+STOP_TIMEOUT = 15.0
+
+
+class DaemonFailed(StationError):
+    """The child process did not start, or did not end, as it should."""
+
+
+def take_tour(config: Config, arguments: Sequence[str], as_json: bool) -> bool:
+    """Start the daemon with ``arguments``, drive it, print the report; whether it passed.
+
+    Raises:
+        StationError: the daemon does not start.
+    """
+    console = Console(stderr=as_json)
+    with _free_endpoint() as endpoint:
+        pass
+    with tempfile.TemporaryFile("w+") as output, console.status("starting the daemon") as line:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "trotd.cli", "run", "--body", "sim", "--listen", endpoint, *arguments],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            with _reach(config.robot.name, endpoint, child, output) as station, Tour(station, config, _shown(line)) as tour:
+                report = tour.drive()
+            report = _stopped(child, output, report)
+        finally:
+            if child.poll() is None:
+                child.kill()
+            child.wait()
+    if as_json:
+        sys.stdout.write(msgspec.json.encode(report).decode() + "\n")
+    else:
+        _print(console, report)
+    return report.passed
+
+
+@contextlib.contextmanager
+def _free_endpoint() -> Iterator[str]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        yield f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def _reach(robot: str, endpoint: str, child: subprocess.Popen[bytes], output: IO[str]) -> Iterator[Station]:
+    end = time.monotonic() + START_TIMEOUT
+    with contextlib.ExitStack() as stack:
+        while True:
+            if child.poll() is not None:
+                raise DaemonFailed(f"the daemon did not start: {_last_line(output)}")
+            try:
+                station = stack.enter_context(connected(robot, endpoint))
+                break
+            except StationError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.2)
+        yield station
+
+
+def _shown(line: Line) -> Callable[[Status | None, str], None]:
+    """Writes the status line; the way from the daemon is a status message ten times a second."""
+
+    def show(status: Status | None, activity: str) -> None:
+        if status is None:
+            return
+        wanted, measured = status.velocity_command, status.velocity
+        line.update(
+            f"[bold]{activity}[/bold] · {status.mode} · asked {wanted[0]:+.2f} {wanted[1]:+.2f} {wanted[2]:+.2f}"
+            f" · measured {measured[0]:+.2f} {measured[1]:+.2f} {measured[2]:+.2f}"
+            f" · tick {status.tick_p50 * 1e3:.2f}/{status.tick_p99 * 1e3:.2f} ms · overruns {status.overruns}"
+        )
+
+    return show
+
+
+def _stopped(child: subprocess.Popen[bytes], output: IO[str], report: TourReport) -> TourReport:
+    """Stop the daemon and take the recording's place from its last words."""
+    problems = list(report.problems)
+    child.send_signal(signal.SIGTERM)
+    try:
+        code = child.wait(STOP_TIMEOUT)
+        if code:
+            problems.append(f"the daemon ended with code {code}: {_last_line(output)}")
+    except subprocess.TimeoutExpired:
+        problems.append(f"the daemon did not stop within {STOP_TIMEOUT:g} s")
+    output.seek(0)
+    recordings = [line.partition(": ")[2].strip() for line in output if line.startswith("recording: ")]
+    return msgspec.structs.replace(
+        report,
+        problems=problems,
+        passed=report.passed and not problems,
+        recording=recordings[-1] if recordings else "",
+    )
+
+
+def _last_line(output: IO[str]) -> str:
+    output.seek(0)
+    lines = [line.strip() for line in output if line.strip()]
+    return lines[-1].removeprefix("trotd: ") if lines else "no word from it"
+
+
+def _print(console: Console, report: TourReport) -> None:
+    table = Table(title=f"{report.robot} at {report.rate_hz:g} Hz")
+    for name in ("leg", "asked", "measured", "RMSE", "roll", "pitch", "falls", "estimator", "tick p50/p99", "late", ""):
+        table.add_column(name, justify="left" if name in ("leg", "") else "right")
+    for leg in report.legs:
+        table.add_row(
+            leg.name,
+            " ".join(f"{value:+.2f}" for value in leg.commanded),
+            " ".join(f"{value:+.2f}" for value in leg.measured),
+            f"{leg.rmse:.3f}",
+            f"{leg.roll:.2f}",
+            f"{leg.pitch:.2f}",
+            str(leg.falls),
+            f"{leg.estimator_rmse:.3f}",
+            f"{leg.tick_p50 * 1e3:.2f}/{leg.tick_p99 * 1e3:.2f}",
+            str(leg.overruns),
+            "; ".join(leg.problems) or "ok",
+        )
+    console.print(table)
+    console.print("velocities vx vy m/s, yaw rate rad/s, simulator's truth; RMSE and estimator m/s; tilt rad; tick ms")
+    for problem in report.problems:
+        console.print(f"problem: {problem}", style="red", markup=False)
+    console.print(f"recording: {report.recording}", soft_wrap=True)
+    console.print(f"{'passed' if report.passed else 'FAILED'} in {report.seconds:.0f} s", style="bold")
