@@ -1,0 +1,120 @@
+"""The desk's end of the link: one zenoh session to one robot, with a time limit on every question.
+
+zenoh answers nobody who may not ask: silence is reported as "nobody answers, or it is not permitted".
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from queue import Empty, SimpleQueue
+from typing import Any, TypeVar
+
+import msgspec
+import zenoh
+
+from runtime.messages import Keys, Status
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+Answer = TypeVar("Answer")
+
+
+class StationError(RuntimeError):
+    """What the operator must know to go on: the message names the robot, the endpoint or the file."""
+
+
+class NoAnswer(StationError):
+    """Nobody answered in time."""
+
+
+def session_config(endpoint: str) -> zenoh.Config:
+    """A client of the one endpoint that is named; no scouting."""
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", "client"),
+        ("connect/endpoints", [endpoint]),
+        ("scouting/multicast/enabled", False),
+        ("scouting/gossip/enabled", False),
+    ):
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Station:
+    """One robot, as reached from the desk."""
+
+    def __init__(self, session: zenoh.Session, robot: str, endpoint: str) -> None:
+        self.session = session
+        self.robot = robot
+        self.endpoint = endpoint
+        self.keys = Keys(robot)
+
+    def ask(self, key: str, payload: bytes | None = None, parameters: str = "", timeout: float = 5.0) -> bytes:
+        """The one reply to a query on ``key``.
+
+        Args:
+            key: one of ``keys``.
+            payload: what is sent along.
+            parameters: zenoh's selector parameters, such as ``write`` or ``name=x``.
+            timeout: how long to wait, s.
+
+        Raises:
+            NoAnswer: silence for ``timeout``.
+            StationError: the robot answered with an error.
+        """
+        selector = f"{key}?{parameters}" if parameters else key
+        for reply in self.session.get(selector, payload=payload, timeout=timeout):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+            assert reply.err is not None
+            words = reply.err.payload.to_bytes()
+            if words != b"Timeout":
+                raise StationError(f"robot {self.robot!r}: {words.decode(errors='replace')}")
+        raise NoAnswer(
+            f"robot {self.robot!r} at {self.endpoint} does not answer on {key} within {timeout:g} s:"
+            " it is another robot's endpoint, or this certificate may not ask"
+        )
+
+    def ask_for(self, kind: type[Answer], key: str, payload: bytes | None = None, parameters: str = "") -> Answer:
+        """``ask``, with the JSON reply decoded to ``kind``."""
+        data = self.ask(key, payload, parameters)
+        try:
+            return msgspec.json.decode(data, type=kind)
+        except msgspec.MsgspecError as error:
+            raise StationError(f"robot {self.robot!r}: reply on {key}: {error}") from error
+
+    def next_status(self, timeout: float = 2.0) -> Status:
+        """The next status that the robot sends.
+
+        Raises:
+            NoAnswer: none within ``timeout`` seconds.
+        """
+        arrived: SimpleQueue[bytes] = SimpleQueue()
+        subscriber: Any = self.session.declare_subscriber(self.keys.status, lambda s: arrived.put(s.payload.to_bytes()))
+        try:
+            return msgspec.json.decode(arrived.get(timeout=timeout), type=Status)
+        except Empty:
+            raise NoAnswer(f"robot {self.robot!r} at {self.endpoint}: no status within {timeout:g} s") from None
+        except msgspec.MsgspecError as error:
+            raise StationError(f"robot {self.robot!r}: status: {error}") from error
+        finally:
+            subscriber.undeclare()
+
+
+@contextlib.contextmanager
+def connected(robot: str, endpoint: str = DEFAULT_ENDPOINT) -> Iterator[Station]:
+    """A station for ``robot``, closed at the end.
+
+    Raises:
+        StationError: nobody listens at the endpoint, or it refuses this side's certificate.
+    """
+    zenoh.init_log_from_env_or("off")
+    try:
+        session: Any = zenoh.open(session_config(endpoint))
+    except zenoh.ZError as error:
+        raise StationError(f"nobody to talk to at {endpoint}: is the daemon running there?") from error
+    try:
+        yield Station(session, robot, endpoint)
+    finally:
+        session.close()

@@ -1,0 +1,141 @@
+"""``trotd view``: one robot in rerun, live or from a recording, in a process of its own.
+
+Nothing here can hold the robot up: what the viewer does not take is dropped, first by the link, then by this process,
+and memory has a bound on both sides.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import rerun as rr
+
+from drivers.description import RobotDescription
+from runtime import config, recorder
+from station.blueprint import build_blueprint
+from station.canvas import Canvas
+from station.session import Station, StationError
+from station.ticks import TickStream, check_fields
+
+DRAW_SECONDS = 0.05
+"""Ticks are gathered for this long and drawn in one go."""
+SILENCE_SECONDS = 5.0
+CHUNK = 2000
+"""Ticks of a recording drawn at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Screen:
+    """Where the drawing goes: a file, a browser, or a window."""
+
+    save: Path | None = None
+    web: bool = False
+    web_port: int = 9090
+    grpc_port: int = 9876
+    memory: str = "1GiB"
+    """The viewer's bound; its oldest data go first."""
+
+    def open(self, name: str) -> rr.RecordingStream:
+        """A stream that ends on this screen, laid out for a robot.
+
+        Raises:
+            StationError: the file cannot be written, or there is no viewer to start.
+        """
+        stream = rr.RecordingStream("trotd", recording_id=None)
+        stream.send_recording_name(name)
+        blueprint = build_blueprint()
+        try:
+            if self.save is not None:
+                stream.save(self.save, default_blueprint=blueprint)
+            elif self.web:
+                url = stream.serve_grpc(
+                    grpc_port=self.grpc_port, default_blueprint=blueprint, server_memory_limit=self.memory
+                )
+                rr.serve_web_viewer(web_port=self.web_port, open_browser=False, connect_to=url)
+            else:
+                rr.spawn(
+                    port=self.grpc_port,
+                    memory_limit=self.memory,
+                    default_blueprint=blueprint,
+                    executable_path=_find_viewer(),
+                    recording=stream,
+                )
+        except (OSError, RuntimeError) as error:
+            raise StationError(f"viewer: {error}") from error
+        return stream
+
+
+def view_recording(path: Path, screen: Screen) -> rr.RecordingStream:
+    """Draw a whole recording.
+
+    Raises:
+        RecordingError, ConfigError, StationError: the file cannot be read, or another version wrote it.
+    """
+    recording = recorder.load(path)
+    check_fields(recording.ticks.dtype, str(path))
+    description = config.parse(tomllib.loads(recording.header.robot_toml), f"{path}: robot").robot
+    stream = screen.open(path.name)
+    canvas = Canvas(stream, description)
+    for first in range(0, len(recording.ticks), CHUNK):
+        canvas.draw(recording.ticks[first : first + CHUNK])
+    canvas.draw_events(recording.header.events)
+    stream.flush(timeout_sec=60.0)
+    return stream
+
+
+def view_live(
+    station: Station, description: RobotDescription, screen: Screen, more: Callable[[], bool] = lambda: True
+) -> int:
+    """Draw what comes until ``more`` says no; returns how many ticks were lost on the way.
+
+    Raises:
+        StationError: the robot does not answer, runs another version, or the screen no longer takes anything.
+    """
+    with TickStream(station) as ticks:
+        canvas = Canvas(screen.open(station.robot), description)
+        bound = MemoryBound()
+        heard = time.monotonic()
+        while more():
+            time.sleep(DRAW_SECONDS)
+            batch = ticks.take()
+            now = time.monotonic()
+            if len(batch):
+                heard = now
+            elif now - heard > SILENCE_SECONDS:
+                heard = now
+                canvas.stream.log("event", rr.TextLog(f"no ticks for {SILENCE_SECONDS:g} s", level="WARN"))
+            bound.check()
+            canvas.draw(batch)
+            canvas.draw_events(ticks.take_events())
+        canvas.stream.flush(timeout_sec=5.0)
+        return ticks.lost
+
+
+def _find_viewer() -> str | None:
+    """rerun's program beside this Python, which need not be on the PATH; None leaves the search to rerun."""
+    beside = Path(sys.executable).with_name("rerun")
+    return str(beside) if beside.is_file() else None
+
+
+class MemoryBound:
+    """Ends a process whose screen has stopped taking: what it would buffer has a bound."""
+
+    def __init__(self, megabytes: int = 500) -> None:
+        self._bound = _resident() + megabytes * 1_000_000
+
+    def check(self) -> None:
+        """Raise StationError beyond the bound."""
+        used = _resident()
+        if used > self._bound:
+            raise StationError(f"the viewer does not take what it is sent: {used / 1e6:.0f} MB wait for it")
+
+
+def _resident() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()

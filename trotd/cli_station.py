@@ -1,0 +1,73 @@
+"""``trotd view`` and the other commands of the operator's desk: one thin function each."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+
+app = typer.Typer(no_args_is_help=True)
+RobotOption = Annotated[str, typer.Option("--robot", help="A shipped robot's name or a .toml file.")]
+ConnectOption = Annotated[str, typer.Option("--connect", help="Where the daemon listens.")]
+
+
+@contextlib.contextmanager
+def refusals() -> Iterator[None]:
+    """What the user can mend, as one line and exit code 1; Ctrl-C as 130."""
+    from runtime.config import ConfigError
+    from runtime.policies import PolicyError
+    from runtime.recorder import RecordingError
+    from station.session import StationError
+
+    try:
+        yield
+    except (ConfigError, PolicyError, RecordingError, StationError) as error:
+        typer.echo(f"trotd: {error}", err=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+@app.command()
+def view(
+    recording: Annotated[Path | None, typer.Argument(help="A recording; without one, the live robot.")] = None,
+    robot: RobotOption = "stoch3",
+    connect: ConnectOption = ENDPOINT,
+    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser.")] = False,
+    web_port: Annotated[int, typer.Option(help="Where the browser finds it.")] = 9090,
+    port: Annotated[int, typer.Option(help="Where the viewer takes data.")] = 9876,
+    save: Annotated[Path | None, typer.Option("--save", help="Write an .rrd file instead.")] = None,
+    memory: Annotated[str, typer.Option(help="The viewer's memory at most.")] = "1GiB",
+    seconds: Annotated[float, typer.Option(help="Stop after this time; 0 for never.")] = 0.0,
+) -> None:
+    """See the robot: body, forces, charts and events, live or from a recording."""
+    import time
+
+    from runtime import config
+    from station import viewer
+    from station.session import connected
+
+    screen = viewer.Screen(save=save, web=web, web_port=web_port, grpc_port=port, memory=memory)
+    end = time.monotonic() + seconds if seconds > 0 else float("inf")
+    if web:
+        typer.echo(f"viewer: http://127.0.0.1:{web_port}  (Ctrl-C ends it)", err=True)
+    with refusals():
+        if recording is not None:
+            viewer.view_recording(recording, screen)
+            while web and time.monotonic() < end:
+                time.sleep(0.1)
+        else:
+            known = config.load(config.find_robot(robot))
+            with connected(known.robot.name, connect) as station:
+                lost = viewer.view_live(station, known.robot, screen, lambda: time.monotonic() < end)
+            typer.echo(f"{lost} ticks lost", err=True)
+
+
+if __name__ == "__main__":
+    app()
