@@ -78,6 +78,7 @@ DAMIAO_FAULTS = {
 }
 _DAMIAO_ENABLED = 1
 _DISABLED = 0
+_LOST_COMMUNICATION = 13
 _RUNNING = 10
 _FAULT = 1
 _HALF = 0.5 + 1e-9
@@ -95,6 +96,7 @@ class MitCodec:
     running = _RUNNING
     """Modes are named like moteus': 0 disabled, 1 fault, 10 running. A CubeMars motor does not tell: 10."""
     starting: tuple[int, ...] = (_DISABLED,)
+    latches = frozenset([_LOST_COMMUNICATION])
 
     def __init__(self, ids: Sequence[int], *, model: str, host: int = 0) -> None:
         if model not in RANGES:

@@ -81,6 +81,7 @@ class MoteusCodec:
     running = int(Mode.POSITION)
     """The mode in which a servo obeys; from 0 a command passes through 2, 3 and 4 to it."""
     starting: tuple[int, ...] = (0, 2, 3, 4)
+    latches = frozenset(range(int(Mode.PWM), int(Mode.BRAKE) + 1))
 
     def __init__(
         self,

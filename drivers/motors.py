@@ -28,6 +28,8 @@ class MotorCodec(Protocol):
     fd: bool
     running: int
     starting: tuple[int, ...]
+    latches: frozenset[int]
+    """Fault codes that only say that the motor stopped listening: a stop clears them for good."""
     command_ids: list[int]
     reply_ids: list[int]
     query: list[bytes]
