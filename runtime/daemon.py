@@ -94,10 +94,9 @@ class Daemon:
         """
         self._stop = asyncio.Event()
         notifier = Notifier()
-        with state.lock(self.job.folder, self.config.robot.name), contextlib.closing(notifier):
-            with self._signals():
-                async with self._connected(), self._linked():
-                    await self._serve(notifier)
+        with state.lock(self.job.folder, self.config.robot.name), contextlib.closing(notifier), self._signals():
+            async with self._connected(), self._linked():
+                await self._serve(notifier)
 
     def stop(self) -> None:
         """End the loop after this tick."""

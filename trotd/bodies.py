@@ -5,10 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import asin, atan2, cos, sin
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.robot import Robot
+import msgspec
+
+from drivers.robot import Array, Robot
 from runtime.config import Config
 from runtime.link import Channel
 from runtime.messages import Keys, SimTruth, decode_push
@@ -91,29 +94,26 @@ def _sim(config: Config, robot_file: Path) -> Body:
 
 def _truth(robot: SimRobot, stamp: float) -> bytes:
     """The state after the last exchange, which the next measurement will be of."""
-    import msgspec
-
-    from sim.model import rpy_of
-
     truth = robot.world.truth
-    rpy = rpy_of(truth.rotation_body_to_world)
-    forward, left = _into_heading(truth.linear_velocity[0], truth.linear_velocity[1], -rpy[2])
+    roll, pitch, yaw = _rpy(truth.rotation_body_to_world)
+    forward, left = _turned(truth.linear_velocity[0], truth.linear_velocity[1], -yaw)
     x, y, z = truth.position.tolist()
-    roll, pitch, yaw = rpy.tolist()
     velocity = (forward, left, float(truth.angular_velocity[2]))
-    return msgspec.json.encode(SimTruth(stamp, (x, y, z), (roll, pitch, yaw), velocity, robot.world.fallen()))
+    return msgspec.json.encode(SimTruth(stamp, (x, y, z), (roll, pitch, yaw), velocity, bool(robot.world.fallen())))
 
 
 def _push(robot: SimRobot, data: bytes) -> None:
-    from sim.model import rpy_of
-
     push = decode_push(data)
-    yaw = float(rpy_of(robot.world.truth.rotation_body_to_world)[2])
-    x, y = _into_heading(push.force[0], push.force[1], yaw)
+    _, _, yaw = _rpy(robot.world.truth.rotation_body_to_world)
+    x, y = _turned(push.force[0], push.force[1], yaw)
     robot.push((x, y, push.force[2]), push.duration)
 
 
-def _into_heading(x: float, y: float, yaw: float) -> tuple[float, float]:
-    from math import cos, sin
+def _rpy(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw of a rotation matrix (3, 3), rad."""
+    r = rotation.tolist()
+    return atan2(r[2][1], r[2][2]), -asin(max(-1.0, min(1.0, r[2][0]))), atan2(r[1][0], r[0][0])
 
-    return float(x * cos(yaw) - y * sin(yaw)), float(x * sin(yaw) + y * cos(yaw))
+
+def _turned(x: float, y: float, angle: float) -> tuple[float, float]:
+    return float(x * cos(angle) - y * sin(angle)), float(x * sin(angle) + y * cos(angle))

@@ -5,13 +5,9 @@ Exit codes: 0 done, 1 it failed, 2 bad input.
 
 from __future__ import annotations
 
-import os
-
-for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(_threads, "1")  # before numpy loads: small matrices are 80 times slower on two threads
-
 import contextlib
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,12 +18,16 @@ import typer
 if TYPE_CHECKING:
     from runtime.config import Config
 
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")  # before numpy loads: small matrices are 80 times slower on two threads
+
 FAILED, BAD_INPUT = 1, 2
 
 app = typer.Typer(
     name="trotd",
     no_args_is_help=True,
     add_completion=False,
+    pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     help="""Runtime service for force-controlled quadrupeds.
 

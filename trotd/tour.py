@@ -25,6 +25,8 @@ from station.tour import Tour, TourReport
 START_TIMEOUT = 180.0
 """s; the first start of all compiles the core."""
 STOP_TIMEOUT = 15.0
+TABLE_WIDTH = 132
+"""Characters that the report needs; a narrower terminal wraps it."""
 
 
 class DaemonFailed(StationError):
@@ -38,6 +40,7 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool) -> bool:
         StationError: the daemon does not start.
     """
     console = Console(stderr=as_json)
+    console = Console(stderr=as_json, width=max(TABLE_WIDTH, console.width))
     with _free_endpoint() as endpoint:
         pass
     with tempfile.TemporaryFile("w+") as output, console.status("starting the daemon") as line:
@@ -47,7 +50,10 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool) -> bool:
             stderr=subprocess.STDOUT,
         )
         try:
-            with _reach(config.robot.name, endpoint, child, output) as station, Tour(station, config, _shown(line)) as tour:
+            with (
+                _reach(config.robot.name, endpoint, child, output) as station,
+                Tour(station, config, _shown(line)) as tour,
+            ):
                 report = tour.drive()
             report = _stopped(child, output, report)
         finally:
@@ -130,7 +136,7 @@ def _last_line(output: IO[str]) -> str:
 def _print(console: Console, report: TourReport) -> None:
     table = Table(title=f"{report.robot} at {report.rate_hz:g} Hz")
     for name in ("leg", "asked", "measured", "RMSE", "roll", "pitch", "falls", "estimator", "tick p50/p99", "late", ""):
-        table.add_column(name, justify="left" if name in ("leg", "") else "right")
+        table.add_column(name, no_wrap=True, justify="left" if name in ("leg", "") else "right")
     for leg in report.legs:
         table.add_row(
             leg.name,
