@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from drivers.description import Record, RobotDescription
+from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
 from runtime.control.parameters import ControlConfig
 from runtime.parameters import (
     CommandConfig,
@@ -44,6 +45,10 @@ class Config(Record, frozen=True, kw_only=True):
     recorder: RecorderConfig = RecorderConfig()
     realtime: RealtimeConfig = RealtimeConfig()
     tour: TourConfig = TourConfig()
+    bus: BusConfig | None = None
+    """The wires to the motors; a robot that is only simulated has none, and neither of the next two."""
+    motors: MotorsConfig | None = None
+    imu: ImuConfig | None = None
 
 
 def find_robot(name: str) -> Path:
