@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from runtime.control.compilation import compiled
 from runtime.control.kinematics import gravity_of_leg
 
@@ -17,9 +15,8 @@ def foot_force(g, leg, q, torque, up, jacobian, force):  # type: ignore[no-untyp
 
     ``up`` (3,) is the world's z axis in the body frame. Inertial forces of a swinging leg are not modelled.
     """
-    gravity = np.empty(3)
-    gravity_of_leg(g, leg, q, up, gravity)
-    r0, r1, r2 = gravity[0] - torque[0], gravity[1] - torque[1], gravity[2] - torque[2]
+    gravity_of_leg(g, leg, q, up, force)
+    r0, r1, r2 = force[0] - torque[0], force[1] - torque[1], force[2] - torque[2]
     determinant = 0.0
     for i in range(3):
         a, b = jacobian[(i + 1) % 3], jacobian[(i + 2) % 3]
@@ -37,6 +34,6 @@ def feel_contacts(p, s, t):  # type: ignore[no-untyped-def]
     """Contact of every foot from the vertical force, with hysteresis; early in a swing none can begin, only end."""
     for leg in range(4):
         bound = p.contact_release if s.contacts[leg] else p.contact_threshold
-        blind = not s.contacts[leg] and s.swinging[leg] and t.phase[leg] < p.contact_blanking
+        blind = not s.contacts[leg] and s.swinging[leg] and s.phase[leg] < p.contact_blanking
         s.contacts[leg] = t.contact_force[leg, 2] > bound and not blind
         t.contacts[leg] = s.contacts[leg]

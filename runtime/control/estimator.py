@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from runtime.control.compilation import compiled
 from runtime.control.contact import feel_contacts, foot_force
 from runtime.control.kinematics import GRAVITY, foot_of_leg, jacobian_of_leg
@@ -45,6 +43,16 @@ def times(rotation, vector, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def turned(rotation, x, y, z):  # type: ignore[no-untyped-def]
+    """Rotation (3, 3) times the vector x y z, as three numbers."""
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )
+
+
+@compiled
 def transposed_times(rotation, vector, out):  # type: ignore[no-untyped-def]
     """Write rotation transposed times vector (3,) into ``out`` (3,)."""
     for i in range(3):
@@ -52,18 +60,14 @@ def transposed_times(rotation, vector, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def estimate(p, g, s, t, rotation, imu, joints, jacobian):  # type: ignore[no-untyped-def]
+def estimate(p, g, s, t, m):  # type: ignore[no-untyped-def]
     """One tick of contact, filter and height: fills the estimate's fields of the tick record ``t``.
 
-    Args:
-        p, g, s, t: parameters, geometry, state and tick records.
-        rotation: (3, 3) body to heading frame, written here.
-        imu: (10,) quaternion, angular velocity, linear acceleration.
-        joints: (3, 4, 3) position, velocity, torque.
-        jacobian: (4, 3, 3) body frame, written here.
+    ``m`` is working memory of ``WORK_DTYPE`` (``state``): the measurement is read there, what later rooms need again
+    is left there.
     """
-    to_world = np.empty((3, 3))
-    rotation_from(imu[:4], to_world)
+    rotation, to_world = m.rotation, m.to_world
+    rotation_from(m.imu[:4], to_world)
     yaw = math.atan2(to_world[1, 0], to_world[0, 0])
     t.rpy[0] = math.atan2(to_world[2, 1], to_world[2, 2])
     t.rpy[1] = -math.asin(min(1.0, max(-1.0, to_world[2, 0])))
@@ -73,58 +77,53 @@ def estimate(p, g, s, t, rotation, imu, joints, jacobian):  # type: ignore[no-un
         rotation[0, i] = c * to_world[0, i] + sn * to_world[1, i]
         rotation[1, i] = -sn * to_world[0, i] + c * to_world[1, i]
         rotation[2, i] = to_world[2, i]
-    foot, force = np.empty(3), np.empty(3)
-    in_world = np.empty((4, 3))
-    odometry = np.empty((4, 3))
-    rolling = np.empty((4, 3))
     for leg in range(4):
-        q = joints[0, leg]
-        foot_of_leg(g, leg, q, foot)
-        jacobian_of_leg(g, leg, q, jacobian[leg])
-        times(rotation, foot, t.feet[leg])
-        times(to_world, foot, in_world[leg])
-        foot_force(g, leg, q, joints[2, leg], to_world[2], jacobian[leg], force)
-        times(rotation, force, t.contact_force[leg])
-        _leg_odometry(g, q, joints[1, leg], imu[4:7], foot, jacobian[leg], to_world, odometry[leg], rolling[leg])
+        q = m.joints[0, leg]
+        foot_of_leg(g, leg, q, m.foot)
+        jacobian_of_leg(g, leg, q, m.jacobian[leg])
+        times(rotation, m.foot, t.feet[leg])
+        times(to_world, m.foot, m.foot_in_world[leg])
+        foot_force(g, leg, q, m.joints[2, leg], to_world[2], m.jacobian[leg], m.force)
+        times(rotation, m.force, t.contact_force[leg])
+        _leg_odometry(g, m, leg)
     feel_contacts(p, s, t)
     if not s.started:
-        _start(p, s, in_world)
-    _predict(p, s, to_world, imu[7:10], rolling)
+        _start(p, s, m.foot_in_world)
+    _predict(p, s, m)
     for leg in range(4):
-        _update(p, s, leg, in_world[leg], odometry[leg])
+        _update(p, s, m, leg)
     _height(p, g, s, t)
     _slope(p, s, t, c, sn)
     t.twist[0] = c * s.velocity[0] + sn * s.velocity[1]
     t.twist[1] = -sn * s.velocity[0] + c * s.velocity[1]
     t.twist[2] = s.velocity[2]
-    times(rotation, imu[4:7], t.twist[3:6])
+    times(rotation, m.imu[4:7], t.twist[3:6])
     for i in range(3):
         s.position[i] += s.velocity[i] * p.dt
         t.position[i] = s.position[i]
 
 
 @compiled
-def _leg_odometry(g, q, speed, rate, foot, jacobian, to_world, velocity, rolling):  # type: ignore[no-untyped-def]
-    """Velocity (3,) that the body has if this foot rolls without slipping, and of the rolling foot's centre, world.
+def _leg_odometry(g, m, leg):  # type: ignore[no-untyped-def]
+    """Velocity that the body has if this foot rolls without slipping, and of the rolling foot's centre, world.
 
     A sphere's centre moves while its shank turns above the ground: 5 % of the walking speed.
     """
-    relative, turning, scratch = np.empty(3), np.empty(3), np.empty(3)
-    times(jacobian, speed, relative)
-    relative[0] += rate[1] * foot[2] - rate[2] * foot[1]
-    relative[1] += rate[2] * foot[0] - rate[0] * foot[2]
-    relative[2] += rate[0] * foot[1] - rate[1] * foot[0]
+    q, speed, foot, rate = m.joints[0, leg], m.joints[1, leg], m.foot, m.imu[4:7]
+    x, y, z = turned(m.jacobian[leg], speed[0], speed[1], speed[2])
+    x += rate[1] * foot[2] - rate[2] * foot[1]
+    y += rate[2] * foot[0] - rate[0] * foot[2]
+    z += rate[0] * foot[1] - rate[1] * foot[0]
+    x, y, z = turned(m.to_world, x, y, z)
     bend = speed[1] + speed[2]
-    scratch[0] = rate[0] + speed[0]
-    scratch[1] = rate[1] + bend * math.cos(q[0])
-    scratch[2] = rate[2] + bend * math.sin(q[0])
-    times(to_world, scratch, turning)
-    rolling[0] = turning[1] * g.foot_radius
-    rolling[1] = -turning[0] * g.foot_radius
-    rolling[2] = 0.0
-    times(to_world, relative, velocity)
-    for i in range(3):
-        velocity[i] = rolling[i] - velocity[i]
+    turning = rate[0] + speed[0], rate[1] + bend * math.cos(q[0]), rate[2] + bend * math.sin(q[0])
+    about_x, about_y, _ = turned(m.to_world, turning[0], turning[1], turning[2])
+    m.rolling[leg, 0] = about_y * g.foot_radius
+    m.rolling[leg, 1] = -about_x * g.foot_radius
+    m.rolling[leg, 2] = 0.0
+    m.odometry[leg, 0] = m.rolling[leg, 0] - x
+    m.odometry[leg, 1] = m.rolling[leg, 1] - y
+    m.odometry[leg, 2] = -z
 
 
 @compiled
@@ -144,15 +143,15 @@ def _start(p, s, in_world):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _predict(p, s, to_world, acceleration, rolling):  # type: ignore[no-untyped-def]
+def _predict(p, s, m):  # type: ignore[no-untyped-def]
     covariance = s.covariance
-    gained = np.empty(3)
-    times(to_world, acceleration, gained)
-    gained[2] -= GRAVITY
-    for i in range(3):
-        for leg in range(4):
-            s.support[leg, i] += p.dt * (rolling[leg, i] - s.velocity[i])
-        s.velocity[i] += p.dt * gained[i]
+    for leg in range(4):
+        for i in range(3):
+            s.support[leg, i] += p.dt * (m.rolling[leg, i] - s.velocity[i])
+    x, y, z = turned(m.to_world, m.imu[7], m.imu[8], m.imu[9])
+    s.velocity[0] += p.dt * x
+    s.velocity[1] += p.dt * y
+    s.velocity[2] += p.dt * (z - GRAVITY)
     for leg in range(1, 5):
         for i in range(5):
             covariance[leg, i] -= p.dt * covariance[0, i]
@@ -164,29 +163,32 @@ def _predict(p, s, to_world, acceleration, rolling):  # type: ignore[no-untyped-
 
 
 @compiled
-def _update(p, s, leg, foot, velocity):  # type: ignore[no-untyped-def]
+def _update(p, s, m, leg):  # type: ignore[no-untyped-def]
     """Two scalar updates for a foot at rest; one in the air or just landed is only where kinematics says."""
     covariance = s.covariance
     row = leg + 1
     s.rested[leg] = s.rested[leg] + p.dt if s.contacts[leg] else 0.0
     if s.rested[leg] <= p.settling_time:
-        s.support[leg] = foot
+        s.support[leg] = m.foot_in_world[leg]
         covariance[row, :] = 0.0
         covariance[:, row] = 0.0
         covariance[row, row] = p.foot_position_noise**2
         return
-    gain = np.empty(5)
-    for state, noise, measured in ((row, p.foot_position_noise, foot), (0, p.foot_velocity_noise, velocity)):
+    gain, across = m.gain, m.across
+    for state, noise, measured in (
+        (row, p.foot_position_noise, m.foot_in_world[leg]),
+        (0, p.foot_velocity_noise, m.odometry[leg]),
+    ):
         scale = 1.0 / (covariance[state, state] + noise * noise)
         for i in range(5):
-            gain[i] = covariance[i, state] * scale
+            across[i] = covariance[state, i]
+            gain[i] = across[i] * scale
         for axis in range(3):
             known = s.velocity[axis] if state == 0 else s.support[leg, axis]
             innovation = measured[axis] - known
             s.velocity[axis] += gain[0] * innovation
             for i in range(4):
                 s.support[i, axis] += gain[i + 1] * innovation
-        across = covariance[state].copy()
         for i in range(5):
             for k in range(5):
                 covariance[i, k] -= gain[i] * across[k]
@@ -196,16 +198,17 @@ def _update(p, s, leg, foot, velocity):  # type: ignore[no-untyped-def]
 def _slope(p, s, t, c, sn):  # type: ignore[no-untyped-def]
     """Low-passed gradient of the plane through the last foothold of every foot, heading frame."""
     xx, xy, yy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
-    middle = np.zeros(3)
+    middle_x, middle_y, middle_z = 0.0, 0.0, 0.0
     for leg in range(4):
         if s.rested[leg] > p.settling_time:
             for i in range(3):
                 s.footholds[leg, i] = s.position[i] + s.support[leg, i]
-        for i in range(3):
-            middle[i] += 0.25 * s.footholds[leg, i]
+        middle_x += 0.25 * s.footholds[leg, 0]
+        middle_y += 0.25 * s.footholds[leg, 1]
+        middle_z += 0.25 * s.footholds[leg, 2]
     for leg in range(4):
-        dx, dy = s.footholds[leg, 0] - middle[0], s.footholds[leg, 1] - middle[1]
-        dz = s.footholds[leg, 2] - middle[2]
+        dx, dy = s.footholds[leg, 0] - middle_x, s.footholds[leg, 1] - middle_y
+        dz = s.footholds[leg, 2] - middle_z
         x, y = c * dx + sn * dy, c * dy - sn * dx
         xx, xy, yy, xz, yz = xx + x * x, xy + x * y, yy + y * y, xz + x * dz, yz + y * dz
     determinant = xx * yy - xy * xy

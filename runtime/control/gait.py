@@ -71,6 +71,7 @@ def advance_gait(p, s, t, standing):  # type: ignore[no-untyped-def]
             t.phase[leg] = math.pi * share / p.swing_fraction
         elif s.contacts[leg]:
             s.searching[leg] = 0
+        s.phase[leg] = t.phase[leg]
         t.stance[leg] = not (s.swinging[leg] or s.searching[leg])
     if standing and not s.swinging.any():
         s.clock = 1.0 - 1e-9

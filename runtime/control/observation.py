@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from runtime.control.command import wrapped
 from runtime.control.compilation import compiled
 from runtime.control.records import Clamp
@@ -30,7 +28,7 @@ def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
     The *relative* reading subtracts what is wanted: walking height, commanded heading, commanded velocity and turn. The
     *plain* one is the paper's letter. The velocity error is bounded where the policy says so (Past the teacher 4).
     """
-    now = np.empty(14)
+    now = t.observation
     now[0] = t.height
     now[1], now[2], now[3] = t.rpy[0], t.rpy[1], t.rpy[2]
     for i in range(6):
@@ -49,10 +47,9 @@ def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
             now[4 + i] = min(bound, max(-bound, error))
             if now[4 + i] != error:
                 t.clamps |= _OBSERVATION
-    if not s.remembered:
-        s.previous[:] = now
-        s.remembered = 1
     for i in range(14):
+        before = s.previous[i] if s.remembered else now[i]
+        s.previous[i] = now[i]
         t.observation[i] = now[i] * policy.observation_scale[i]
-        t.observation[14 + i] = s.previous[i] * policy.observation_scale[14 + i]
-    s.previous[:] = now
+        t.observation[14 + i] = before * policy.observation_scale[14 + i]
+    s.remembered = 1

@@ -14,6 +14,30 @@ from runtime.control.kinematics import inverse, leg_geometry
 from runtime.control.parameters import ControlConfig
 from runtime.control.records import Records
 
+WORK_DTYPE = np.dtype(
+    [
+        ("imu", "f8", (10,)),  # quaternion, angular velocity, linear acceleration
+        ("joints", "f8", (3, 4, 3)),  # position, velocity, torque
+        ("asked", "f8", (3,)),  # vx, vy, yaw rate of the operator
+        # left by the estimator
+        ("to_world", "f8", (3, 3)),  # body to world
+        ("rotation", "f8", (3, 3)),  # body to heading frame
+        ("jacobian", "f8", (4, 3, 3)),
+        ("foot", "f8", (3,)),
+        ("force", "f8", (3,)),
+        ("foot_in_world", "f8", (4, 3)),
+        ("odometry", "f8", (4, 3)),  # velocity of the body that each foot tells, world, m/s
+        ("rolling", "f8", (4, 3)),  # velocity of each rolling foot's centre, world, m/s
+        ("gain", "f8", (5,)),
+        ("across", "f8", (5,)),
+        # the force problem
+        ("com", "f8", (3,)),  # heading frame
+        ("hessian", "f8", (144,)),
+        ("gradient", "f8", (12,)),
+    ],
+    align=True,
+)
+"""What one tick works with; nothing here is remembered."""
 HIDDEN = 32
 """Largest hidden layer of the small fully-connected policy."""
 
@@ -42,6 +66,7 @@ STATE_DTYPE = np.dtype(
         ("shifts", "f8", (4, 3)),
         # gait
         ("clock", "f8"),  # share of the cycle
+        ("phase", "f8", (4,)),  # swing progress in [0, pi]
         ("swinging", "u1", (4,)),
         ("searching", "u1", (4,)),
         ("stance", "u1", (4,)),

@@ -52,6 +52,16 @@ def command_joints(p, g, s, t, rotation, jacobian, standing, out):  # type: igno
 
 
 @compiled
+def damp_joints(p, t, out):  # type: ignore[no-untyped-def]
+    """The safe command, only damping without stiffness or feed-forward, into ``t`` and ``out`` (5, 4, 3)."""
+    out[:] = 0.0
+    for leg in range(4):
+        out[3, leg] = p.kd
+    t.command_position[:], t.command_velocity[:], t.command_kp[:] = out[0], out[1], out[2]
+    t.command_kd[:], t.command_torque[:] = out[3], out[4]
+
+
+@compiled
 def _schedule_gain(p, s, t, leg, standing):  # type: ignore[no-untyped-def]
     if not t.stance[leg]:
         s.gain_scale[leg] = 1.0
