@@ -1,0 +1,111 @@
+"""The shapes of policy that are trained and compared (paper Section V.B), before their first number is learnt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from drivers.description import RobotDescription
+from drivers.robot import Array
+from runtime.control.observation import OBSERVATION_NAMES
+from runtime.control.policy import BALANCE_TERMS, GRF_NAMES, SHIFT_NAMES, Policy, Terms, balance_policy
+from training.symmetry import (
+    FRONT_BACK,
+    LEFT_RIGHT,
+    Folding,
+    fold_under,
+    mirror_action,
+    mirror_grf_action,
+    mirror_matrix,
+    mirror_observation,
+    no_folding,
+)
+
+HIDDEN = 16
+"""Neurons of the small fully-connected variant."""
+SYMMETRIES = {"none": (), "left-right": (LEFT_RIGHT,), "both": (LEFT_RIGHT, FRONT_BACK)}
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One of the alternatives."""
+
+    output: str = "wrench"
+    """``wrench``, shared among the legs by the quadratic programme, or ``grf`` straight from the policy."""
+    hidden: int = 0
+    """Neurons of the hidden layer; 0 is linear."""
+    reading: str = "relative"
+    """Of the observation: ``relative`` to the command, or ``plain``."""
+
+
+VARIANTS = {
+    "linear": Variant(),
+    "linear-plain": Variant(reading="plain"),
+    "linear-grf": Variant(output="grf"),
+    "mlp": Variant(hidden=HIDDEN),
+    "mlp-plain": Variant(hidden=HIDDEN, reading="plain"),
+    "mlp-grf": Variant(hidden=HIDDEN, output="grf"),
+}
+
+
+def make_policy(
+    description: RobotDescription, walking_height: float, variant: Variant, terms: bool, name: str = "untrained"
+) -> Policy:
+    """A policy of this shape with all readout numbers zero; ``terms`` turns the fixed terms on."""
+    like = balance_policy(description, walking_height)
+    scale, bound = np.array(like.action_scale), np.array(like.action_bound)
+    names = like.action_names
+    if variant.output == "grf":
+        weight = description.mass * 9.81
+        names = SHIFT_NAMES + GRF_NAMES
+        scale = np.concatenate([scale[:12], np.tile(np.array([0.15, 0.15, 0.5]) * weight, 4)])
+        bound = np.concatenate([bound[:12], np.full(12, 2.0 * weight)])
+    hidden: Array = np.random.default_rng(0).normal(0.0, 1.0 / np.sqrt(28), (variant.hidden, 28))
+    readout = np.zeros((len(names), variant.hidden or 28))
+    return msgspec.structs.replace(
+        like,
+        name=name,
+        reading=variant.reading,
+        output=variant.output,
+        observation_names=OBSERVATION_NAMES,
+        action_names=names,
+        action_scale=tuple(scale.tolist()),
+        action_bound=tuple(bound.tolist()),
+        terms=BALANCE_TERMS if terms else Terms(),
+        matrix=() if variant.hidden else _rows(readout),
+        hidden=_rows(hidden) if variant.hidden else (),
+        readout=_rows(readout) if variant.hidden else (),
+        provenance={},
+    )
+
+
+def with_parameters(policy: Policy, parameters: Array) -> Policy:
+    """The same shape with other numbers. ``parameters`` as ``Policy.parameters`` gives them."""
+    if policy.matrix:
+        return msgspec.structs.replace(policy, matrix=_rows(parameters.reshape(len(policy.matrix), 28)))
+    hidden = len(policy.hidden)
+    return msgspec.structs.replace(
+        policy,
+        hidden=_rows(parameters[: hidden * 28].reshape(hidden, 28)),
+        readout=_rows(parameters[hidden * 28 :].reshape(-1, hidden)),
+    )
+
+
+def folding_of(policy: Policy, symmetry: str) -> Folding:
+    """What stays free of a policy's numbers; a hidden layer has no mirror image of its own, so all of its.
+
+    Raises:
+        KeyError: ``symmetry`` is not one of ``SYMMETRIES``.
+    """
+    reflections = SYMMETRIES[symmetry]
+    if not policy.matrix or not reflections:
+        return no_folding(policy.parameters.size)
+    mirror = mirror_grf_action if policy.output == "grf" else mirror_action
+    mirrors = [mirror_matrix(mirror(reflection), mirror_observation(reflection)) for reflection in reflections]
+    return fold_under(mirrors, policy.parameters.size)
+
+
+def _rows(matrix: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())
