@@ -5,7 +5,7 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from drivers.robot import JOINTS, LEGS
-from station.canvas import TIMELINE, VELOCITIES, WRENCH
+from station.canvas import PLACE, TIMELINE, VELOCITIES, WRENCH
 
 TRAIL_SECONDS = 3.0
 WINDOW_SECONDS = 10.0
@@ -22,16 +22,16 @@ def _last(seconds: float) -> rrb.VisibleTimeRange:
 def _scene() -> rrb.Spatial3DView:
     trails = [rrb.VisibleTimeRanges(_last(TRAIL_SECONDS))]
     return rrb.Spatial3DView(
-        origin="world",
+        origin=PLACE,
+        contents="world/**",
         name="Body",
-        eye_controls=rrb.EyeControls3D(
-            position=(1.6, -1.8, 1.1),
-            look_target=(0.0, 0.0, 0.3),
-            eye_up=(0.0, 0.0, 1.0),
-            tracking_entity="world/heading",
-        ),
-        line_grid=rrb.LineGrid3D(visible=True, spacing=0.25),
-        overrides={"world/trail": trails, "world/path": trails},
+        eye_controls=rrb.EyeControls3D(position=(1.1, -1.5, 0.9), look_target=(0.0, 0.0, 0.3), eye_up=(0.0, 0.0, 1.0)),
+        line_grid=rrb.LineGrid3D(visible=False),
+        overrides={
+            "world/trail": trails,
+            "world/path": trails,
+            "world/ground": [rrb.EntityBehavior(interactive=False)],
+        },
     )
 
 

@@ -24,6 +24,10 @@ PORTRAIT_SECONDS = 1.0
 NEWTONS_PER_METRE = 600.0
 """Length of the arrows of force."""
 TIMELINE = "robot time"
+PLACE = "world/place"
+"""The spot on the ground below the body: the eye goes with it, without turning."""
+GROUND_METRES, GROUND_SPACING = 30.0, 0.5
+GROUND_COLOR = (60, 60, 66)
 LEG_COLORS = np.array([[77, 148, 255], [255, 168, 60], [90, 200, 120], [235, 96, 96]], np.uint8)
 BODY_COLOR = (140, 140, 150)
 FORCE_COLOR = (250, 220, 80)
@@ -80,6 +84,8 @@ class Canvas:
     def _draw_static(self) -> None:
         log = self.stream.log
         log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        lines = rr.LineStrips3D(_ground_lines(), colors=[GROUND_COLOR], radii=[0.002])
+        log("world/ground", lines, static=True)
         half = np.array(self._description.body_size) / 2
         log(
             "world/body/box",
@@ -168,6 +174,8 @@ class Canvas:
         position = body_position(ticks)
         turned = orientation_xyzw(ticks)
         send("world/body", when, rr.Transform3D.columns(translation=position, quaternion=turned))
+        place = position * (1.0, 1.0, 0.0)
+        send(PLACE, when, rr.Transform3D.columns(translation=place))
         heading = yaw_quaternion(ticks["rpy"][:, 2])
         send("world/heading", when, rr.Transform3D.columns(translation=position, quaternion=heading))
         send("world/path", when, rr.Points3D.columns(positions=position, radii=[0.006] * n, colors=[BODY_COLOR] * n))
@@ -243,6 +251,14 @@ class Canvas:
                 for leg in range(4)
             ]
             self.stream.log(f"portrait/{name}", rr.LineStrips2D(curves, colors=LEG_COLORS))
+
+
+def _ground_lines() -> list[Array]:
+    """A square of lines around the start, z = 0, m."""
+    steps = np.arange(-GROUND_METRES, GROUND_METRES + 1e-9, GROUND_SPACING)
+    ends = np.array([-GROUND_METRES, GROUND_METRES])
+    along_x = [np.stack([ends, np.full(2, y), np.zeros(2)], axis=1) for y in steps]
+    return along_x + [line[:, (1, 0, 2)] for line in along_x]
 
 
 def _tracking_error(ticks: Records) -> Array:
