@@ -17,7 +17,7 @@ from drivers.bus import Bus
 from drivers.can_bus import PythonCanBus
 from drivers.description import RobotDescription
 from drivers.errors import BusTimeout, DriverError, NotConnected
-from drivers.motors import RESTARTED, Motors, build_codec
+from drivers.motors import RESTARTED, SILENT, Motors, build_codec
 from drivers.pi3hat import Pi3HatBus
 from drivers.robot import JOINTS, LEGS, Array, ImuSample, JointCommand, Measurement
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
@@ -29,6 +29,7 @@ RANGE_MARGIN = 0.35
 """rad beyond its range where a joint's zero is no longer believed."""
 CLEAR_INTERVAL = 1.0
 """s between attempts to bring back motors that latched, while the robot damps."""
+_NOT_CLEARABLE = (0, RESTARTED, SILENT)
 _QUESTIONS = 20
 _STOPS = 3
 
@@ -138,7 +139,7 @@ class HardwareRobot:
         joints = self.motors.joint_state()
         if joints.age.min() > self._clock() - stamp:
             raise BusTimeout(f"no motor answered for {joints.age.min() * 1e3:.0f} ms: supply? emergency stop? bus?")
-        self._faulty = bool(((joints.fault != 0) & (joints.fault != RESTARTED)).any())
+        self._faulty = bool((~np.isin(joints.fault, _NOT_CLEARABLE)).any())
         return Measurement(stamp, self.imu.latest(), joints, self.motors.voltage)
 
     async def close(self) -> None:

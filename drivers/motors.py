@@ -84,6 +84,10 @@ RESTARTED = 16
 """Fault code of ours: a motor that had been running is back at its beginning. Its zero may be lost."""
 NOT_STARTING = 17
 """Fault code of ours: a motor that gets commands but does not begin to obey."""
+SILENT = 18
+"""Fault code of ours: a motor missed more replies in a row than are coasted over."""
+COASTED_TICKS = 2
+"""Replies in a row that a motor may miss: its last reading stands in."""
 START_TIME = 0.25
 """s that a motor may take from stopped to running."""
 
@@ -145,6 +149,7 @@ class Motors:
         self._answered: set[int] = set()
         self._waiting, self._last_sent = False, -np.inf
         self._running = [False] * 12
+        self._missed = [0] * 12
         self._commanding_since: float | None = None
         self._latched: dict[int, int] = {}
 
@@ -220,6 +225,8 @@ class Motors:
         """A fault code of ``joint_state`` in words."""
         if code == RESTARTED:
             return "it restarted by itself: check supply and zero"
+        if code == SILENT:
+            return f"it missed more than {COASTED_TICKS} replies in a row: cable? supply?"
         if code == NOT_STARTING:
             return f"it gets commands but did not begin to obey within {START_TIME} s"
         return self.codec.describe_fault(code)
@@ -231,7 +238,11 @@ class Motors:
         await self.bus.cycle(frames, self._reply_time)
         self._waiting = False
         self._si = self.codec.to_si(np.array(self._readings))
-        self.counters.missed += 12 - len(self._answered)
+        if len(self._answered) < 12:
+            self.counters.missed += 12 - len(self._answered)
+            self._missed = [0 if i in self._answered else count + 1 for i, count in enumerate(self._missed)]
+        else:
+            self._missed = [0] * 12
 
     def _receive(self, bus: int, identifier: int, data: bytes) -> bool:
         counters = self.counters
@@ -249,6 +260,7 @@ class Motors:
         if not self._waiting:
             counters.late += 1
             self._stamps[index] = self._last_sent
+            self._missed[index] = 0
             return False
         counters.duplicate += index in self._answered
         self._answered.add(index)
@@ -273,7 +285,7 @@ class Motors:
         faults = np.zeros(12, dtype=np.int32)
         running = self.codec.running
         for index, reading in enumerate(self._readings):
-            if reading[0] == running and not self._latched:
+            if reading[_MODE] == running and index not in self._latched and self._missed[index] <= COASTED_TICKS:
                 self._running[index] = self._commanding_since is not None
             else:
                 faults[index] = self._fault(index, int(reading[_MODE]), int(reading[_FAULT]), now)
@@ -282,6 +294,8 @@ class Motors:
     def _fault(self, index: int, mode: int, fault: int, now: float) -> int:
         if index in self._latched:
             return self._latched[index]
+        if self._missed[index] > COASTED_TICKS:
+            return SILENT
         if mode == self.codec.running:
             return 0
         if mode not in self.codec.starting:

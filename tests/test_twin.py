@@ -1,0 +1,142 @@
+"""The control cycle over emulated wires: it walks, its estimates hold, and every fault of the wire ends as promised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from twin_walk import TwinWalk
+
+from drivers.motors import COASTED_TICKS
+from runtime.messages import Mode, Request
+from runtime.modes import Reason
+from sim.build import build_of, lab_build, scrambled
+
+
+def test_it_walks_over_the_wires_and_knows_how_fast():
+    walk = TwinWalk()
+    walk.stand()
+    assert walk.motors.counters.missed == 0
+    walk.ask(Request.WALK)
+    truth, estimate, height = [], [], []
+
+    def note() -> None:
+        state, tick = walk.world.truth, walk.cycle.tick[0]
+        forward = state.rotation_body_to_world[:2, 0] / np.linalg.norm(state.rotation_body_to_world[:2, 0])
+        left = np.array([-forward[1], forward[0]])
+        truth.append([forward @ state.linear_velocity[:2], left @ state.linear_velocity[:2]])
+        estimate.append(tick["twist"][:2].copy())
+        height.append(tick["height"] - state.position[2])
+
+    walk.run(1.5, (0.8, 0.0, 0.0))
+    walk.run(2.5, (0.8, 0.0, 0.0), note)
+    assert walk.cycle.state.mode is Mode.WALK
+    error = np.array(estimate) - np.array(truth)
+    assert np.mean(truth, axis=0) == pytest.approx([0.8, 0.0], abs=0.1)
+    assert np.sqrt((error**2).mean(axis=0)).max() <= 0.05
+    assert np.sqrt(np.mean(np.square(height))) <= 0.01
+
+
+@pytest.fixture
+def standing() -> TwinWalk:
+    walk = TwinWalk(quick=True)
+    walk.stand()
+    return walk
+
+
+def reason(walk: TwinWalk) -> Reason:
+    return walk.cycle.state.fault
+
+
+def silence(walk: TwinWalk) -> None:
+    walk.twin.servos[5].silent = True
+
+
+def unplug(walk: TwinWalk) -> None:
+    walk.twin.wire.faults.unplugged.add(2)
+
+
+def unplug_all(walk: TwinWalk) -> None:
+    walk.twin.wire.faults.unplugged.update(range(4))
+
+
+def overheat(walk: TwinWalk) -> None:
+    walk.twin.overheating[4] = 60.0
+
+
+def encoder_fault(walk: TwinWalk) -> None:
+    walk.twin.servos[1].fail(35)  # type: ignore[attr-defined]
+
+
+def brown_out(walk: TwinWalk) -> None:
+    for servo in walk.twin.servos[6:9]:
+        servo.restart(shift=1 / 6)  # type: ignore[attr-defined]
+
+
+def imu_gone(walk: TwinWalk) -> None:
+    walk.imu.emulator.silent = True
+
+
+@pytest.mark.parametrize(
+    ("fault", "ends_as", "ticks", "named"),
+    [
+        (silence, Reason.MOTOR_FAULT, COASTED_TICKS + 1, "FR knee"),
+        (unplug, Reason.MOTOR_FAULT, COASTED_TICKS + 1, "BL"),
+        (unplug_all, Reason.BODY_SILENT, 1, "no motor answered"),
+        (overheat, Reason.MOTOR_FAULT, 3, "FR hip"),
+        (encoder_fault, Reason.MOTOR_FAULT, 1, "FL hip"),
+        (brown_out, Reason.MOTOR_FAULT, 2, "BL"),
+        (imu_gone, Reason.STALE_IMU, 8, ""),
+    ],
+)
+def test_every_fault_ends_in_damp_in_time_and_is_named(
+    standing: TwinWalk, fault: Callable[[TwinWalk], None], ends_as: Reason, ticks: int, named: str
+):
+    standing.cycle.events.clear()
+    fault(standing)
+    assert standing.ticks_to_damp() <= ticks
+    assert reason(standing) is ends_as
+    assert named in " ".join(event.text for event in standing.cycle.events)
+    assert not standing.command.kp.any()
+    assert not standing.command.torque.any()
+
+
+def test_two_missed_ticks_are_coasted_and_scattered_losses_do_not_matter(standing: TwinWalk):
+    standing.twin.servos[5].silent = True
+    standing.run(COASTED_TICKS / 200)
+    standing.twin.servos[5].silent = False
+    standing.twin.wire.faults.drop = 0.01
+    standing.twin.wire.faults.duplicate = 0.02
+    standing.ask(Request.WALK)
+    standing.run(2.0, (0.4, 0.0, 0.0))
+    assert standing.cycle.state.mode is Mode.WALK
+    counters = standing.motors.counters
+    assert counters.missed > 20
+    assert counters.duplicate > 40
+    assert not standing.world.fallen()
+
+
+def test_the_watchdogs_hold_the_robot_down_when_the_computer_dies(standing: TwinWalk):
+    for _ in range(60):
+        standing._live()  # 0.3 s without a command
+    assert {servo.mode for servo in standing.twin.servos} == {11}
+    assert standing.ticks_to_damp() <= 2
+    standing.run(1.5)
+    standing.ask(Request.CLEAR)
+    standing.run(0.1)
+    standing.ask(Request.ARM, Request.STAND)
+    standing.run(2.0)
+    assert standing.cycle.state.mode is Mode.STAND
+
+
+def test_the_twins_table_is_the_labs_in_another_form():
+    walk_config = TwinWalk.wiring()
+    lab, ours = lab_build(), build_of(walk_config, (1.0, 0.0, 0.0, 0.0))
+    joints = np.random.default_rng(0).uniform(-1, 1, (4, 3))
+    assert lab.to_motor(joints) == pytest.approx(ours.to_motor(joints))
+    assert lab.to_joint(lab.to_motor(joints)) == pytest.approx(joints)
+    other = scrambled(lab, 7)
+    assert sorted(other.id.ravel()) == sorted(lab.id.ravel())
+    assert (other.id != lab.id).any()
+    assert np.linalg.norm(other.mount) == pytest.approx(1.0)
