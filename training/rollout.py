@@ -63,7 +63,13 @@ class Task:
 class Walker(Protocol):
     """A controller: the linear policy's, the teacher's or a baseline's."""
 
-    record: Records
+    @property
+    def record(self) -> Records:
+        """What the last step computed, (1,) of ``CONTROL_DTYPE``."""
+
+    @property
+    def geometry(self) -> Records:
+        """The legs, (1,) of ``GEOMETRY_DTYPE``."""
 
     def reset(self, measurement: Measurement) -> None:
         """Forget everything."""
