@@ -29,7 +29,7 @@ from runtime.control.policy import Policy, encode_policy
 from runtime.control.records import Clamp, SolverStatus, VelocityCommand
 from runtime.cycle import Cycle, Wake
 from runtime.link import Channel, Link
-from runtime.messages import Keys, ModeReply, Request, Status
+from runtime.messages import Keys, Mode, ModeReply, Request, Status
 from runtime.modes import Reason
 from runtime.recorder import Header, Recorder, layout
 from runtime.systemd import Notifier
@@ -324,6 +324,12 @@ class Daemon:
         answer, words = self.cycle.request(wish, self.measurement)
         self._tell_events()
         return ModeReply(answer.accepted, answer.state.mode.name, words)
+
+    def lose_operator(self) -> None:
+        """A driver is gone: a walking robot stands."""
+        if self.cycle.state.mode is Mode.WALK:
+            self.cycle.note("mode", "the operator is gone")
+            self.take_request(Request.STAND)
 
     def take_policy(self, policy: Policy, data: bytes) -> None:
         """Make a verified policy the active one."""

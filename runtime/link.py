@@ -59,6 +59,7 @@ class Doors(Protocol):
 
     def take_velocity(self, command: VelocityCommand) -> None: ...  # noqa: D102
     def take_request(self, wish: Request) -> ModeReply: ...  # noqa: D102
+    def lose_operator(self) -> None: ...  # noqa: D102
     def take_policy(self, policy: Policy, data: bytes) -> None: ...  # noqa: D102
     def refuse(self, door: str, why: str) -> None: ...  # noqa: D102
     def active_policy(self) -> tuple[str, bytes]: ...  # noqa: D102
@@ -222,6 +223,7 @@ class Link:
                     (keys.event, lambda _query: msgspec.json.encode(list(self.history))),
                 )
             ),
+            session.liveliness().declare_subscriber(f"{keys.operator}/*", self._hear_operator),
             session.liveliness().declare_token(keys.alive),
         ]
 
@@ -254,6 +256,11 @@ class Link:
             return
         command = VelocityCommand(stamp, np.array(message.linear), message.yaw_rate)
         self._cross(lambda: self._doors.take_velocity(command))
+
+    def _hear_operator(self, sample: zenoh.Sample) -> None:
+        """A driver came or went; one that went, for whatever cause, stops the walk at once."""
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._cross(self._doors.lose_operator)
 
     def _hearer(self, channel: Channel) -> Callable[[zenoh.Sample], None]:
         accept = channel.accept

@@ -282,6 +282,7 @@ class Keys:
         self.policy = f"{root}/policy"
         self.recording = f"{root}/recording"
         self.alive = f"{root}/alive"
+        self.operator = f"{root}/operator"
         self.sim_truth = f"{root}/sim/truth"
         self.sim_push = f"{root}/sim/push"
 

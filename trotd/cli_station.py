@@ -69,5 +69,31 @@ def view(
             typer.echo(f"{lost} ticks lost", err=True)
 
 
+@app.command()
+def joystick(
+    robot: RobotOption = "stoch3",
+    connect: ConnectOption = ENDPOINT,
+    keyboard: Annotated[bool, typer.Option("--keyboard", help="The terminal's keys instead of a pad.")] = False,
+    pad: Annotated[
+        Path | None, typer.Option(help="The pad's event device, instead of the first that is known.")
+    ] = None,
+    mapping: Annotated[Path | None, typer.Option(help="A TOML that says which code is which stick.")] = None,
+    speed: Annotated[float, typer.Option(min=0.05, max=1.0, help="Full sticks, as a share of the bounds.")] = 0.5,
+) -> None:
+    """Drive with a pad or the keyboard.
+
+    Back damps, Start holds, X sits, Y stands (with the right bumper held it arms first), B walks. Left stick forward
+    and turn, right stick sideways; nothing moves unless the right bumper is held.
+    """
+    from runtime import config
+    from station.desk import drive
+    from station.session import connected
+
+    with refusals():
+        known = config.load(config.find_robot(robot))
+        with connected(known.robot.name, connect) as station:
+            drive(station, known.control.bounds, keyboard, pad, mapping, speed)
+
+
 if __name__ == "__main__":
     app()

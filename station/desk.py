@@ -1,0 +1,67 @@
+"""The driver's terminal: which pad, and one line that tells how it goes."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from runtime.control.parameters import BoundsConfig
+from station import keyboard as terminal
+from station.driving import Driving
+from station.joystick import Joystick, Source
+from station.pad import PadDevice, find_pad, load_mapping, shipped_mappings
+from station.session import Station
+
+
+def open_source(keys: bool, pad: Path | None, mapping: Path | None) -> Source:
+    """The pad or keyboard that the options mean.
+
+    Raises:
+        SourceLost: not there.
+        StationError: the mapping cannot be used.
+    """
+    if keys:
+        return terminal.Keyboard()
+    chosen = None if mapping is None else load_mapping(mapping)
+    if pad is not None:
+        return PadDevice(pad, chosen or dict(shipped_mappings())["xpad"])
+    return PadDevice(*find_pad(chosen))
+
+
+def drive(
+    station: Station, bounds: BoundsConfig, keys: bool, pad: Path | None, mapping: Path | None, speed: float
+) -> None:
+    """Drive until Ctrl-C; ``speed`` is the share of the bounds that full sticks ask for."""
+    if mapping is not None:
+        load_mapping(mapping)
+    forward, sideways = bounds.linear_velocity
+    joystick = Joystick(station, Driving(speed * forward, speed * sideways, speed * bounds.yaw_rate))
+    console = Console(stderr=True)
+    if keys:
+        console.print(terminal.HELP, highlight=False)
+    with Live(console=console, refresh_per_second=5, transient=True) as live, contextlib.suppress(KeyboardInterrupt):
+        joystick.run(lambda: open_source(keys, pad, mapping), lambda j: live.update(describe(j)), lambda: True)
+
+
+def describe(joystick: Joystick) -> Text:
+    """One line: the robot's mode, battery and speed, the link's latency, the last answer."""
+    status = joystick.status
+    if status is None or joystick.deaf:
+        return Text(f"the robot is not heard   {joystick.words}", style="bold red")
+    latency = "-" if joystick.latency is None else f"{joystick.latency * 1e3:.1f} ms"
+    forward, left, turn = status.velocity
+    ready = "centred" if joystick.driving.centred else "centre the sticks"
+    parts = [
+        status.mode + (" armed" if status.armed else ""),
+        f"{forward:+.2f} {left:+.2f} m/s {turn:+.2f} rad/s",
+        f"{status.voltage:.1f} V",
+        f"link {latency}",
+        ready if status.mode == "WALK" else "",
+        f"FAULT {status.fault}" if status.fault else "",
+        joystick.words,
+    ]
+    return Text("   ".join(filter(None, parts)), style="red" if status.fault else "")

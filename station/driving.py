@@ -1,0 +1,64 @@
+"""From hands to the robot: what the sticks and buttons mean now. Pure: no clock, no device, no network.
+
+After anything was lost, and at the start of every walk, nothing moves until the sticks were centred once.
+"""
+
+from __future__ import annotations
+
+from runtime.messages import Mode, Request
+from station.pad import Sticks
+
+Velocity = tuple[float, float, float]
+STILL: Velocity = (0.0, 0.0, 0.0)
+REQUESTS = {
+    "idle": Request.DAMP,
+    "hold": Request.STAND,
+    "sit": Request.SIT,
+    "stand": Request.STAND,
+    "walk": Request.WALK,
+    "clear": Request.CLEAR,
+}
+
+
+class Driving:
+    """The rules of one driver."""
+
+    def __init__(self, forward: float, sideways: float, turn: float) -> None:
+        """``forward``, ``sideways`` in m/s and ``turn`` in rad/s are what full sticks ask for."""
+        self.full: Velocity = (forward, sideways, turn)
+        self.centred = False
+        """The sticks were centred since the last loss or the start of the walk."""
+
+    def lose(self) -> None:
+        """The pad, the link or the robot's ear was lost for a while."""
+        self.centred = False
+
+    def velocity(self, sticks: Sticks | None, mode: Mode | None) -> Velocity | None:
+        """What to command: m/s, m/s, rad/s; None when there is nothing to say.
+
+        Args:
+            sticks: where they are; None while that is not known.
+            mode: the robot's last word; None when it has not been heard for a while.
+        """
+        if mode is not Mode.WALK:
+            self.lose()
+            return None
+        if sticks is None:
+            self.lose()
+            return STILL
+        if sticks.centred:
+            self.centred = True
+        elif not sticks.held:
+            self.lose()
+        if not (self.centred and sticks.held):
+            return STILL
+        forward, sideways, turn = self.full
+        return sticks.forward * forward, sticks.left * sideways, sticks.turn * turn
+
+    @staticmethod
+    def requests(button: str, sticks: Sticks | None, armed: bool) -> list[Request]:
+        """What a pressed button asks for; standing up with the dead-man held arms first."""
+        wish = REQUESTS[button]
+        if button == "stand" and not armed and sticks is not None and sticks.held:
+            return [Request.ARM, wish]
+        return [wish]
