@@ -191,16 +191,17 @@ class Cycle:
             case Mode.STAND:
                 command = self.controller.step(measurement, self._rest, True)
             case Mode.WALK:
-                command = self.controller.step(measurement, self._fresh_velocity(wake.stamp), False)
+                command = self._walk(wake.stamp, measurement)
         self.solver[self.tick["solver_status"][0]] += 1
         return self._blended(command)
 
-    def _fresh_velocity(self, now: float) -> VelocityCommand:
-        """The newest command, or rest once it is too old; the controller bounds how fast it follows."""
-        command = self._velocity
-        if now - command.stamp > self.config.command.expiry:
+    def _walk(self, now: float, measurement: Measurement) -> JointCommand:
+        """Follow the newest command, or rest once it is too old; the controller bounds how fast it follows."""
+        expired = now - self._velocity.stamp > self.config.command.expiry
+        command = self.controller.step(measurement, self._rest if expired else self._velocity, False)
+        if expired:
+            self._velocity = VelocityCommand(stamp=self._velocity.stamp)
             self.tick["clamps"] |= np.uint32(Clamp.EXPIRED)
-            return self._rest
         return command
 
     def _blended(self, command: JointCommand) -> JointCommand:

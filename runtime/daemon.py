@@ -56,7 +56,7 @@ class Job:
     channels: Callable[[Keys], Sequence[Channel]] = field(default=lambda _keys: ())
     """Keys that belong to this body alone."""
     ready: Callable[[], None] = field(default=lambda: None)
-    """Called once the first tick is about to begin."""
+    """Called once, after the first tick."""
 
 
 class Daemon:
@@ -82,6 +82,7 @@ class Daemon:
         self._policy_file = job.folder / "policies" / f"{job.config.robot.name}.json"
         self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
         self._stop: asyncio.Event | None = None
+        self._write_due: asyncio.Event
         self._writes: deque[tuple[int, str, Future[Path] | None]] = deque()
         self._held = False
 
@@ -92,7 +93,7 @@ class Daemon:
             AlreadyRunning, LinkError, DriverError, RealtimeError: it could not start.
             ExceptionGroup: what broke the loop, after the body was damped.
         """
-        self._stop = asyncio.Event()
+        self._stop, self._write_due = asyncio.Event(), asyncio.Event()
         notifier = Notifier()
         with state.lock(self.job.folder, self.config.robot.name), contextlib.closing(notifier), self._signals():
             async with self._connected(), self._linked():
@@ -188,8 +189,6 @@ class Daemon:
         command = damp_command(self.config.damp.kd)
         realtime.settle_garbage()
         with Ticker(self.config.control.rate_hz) as ticker:
-            self.job.ready()
-            notifier.tell("READY=1")
             while not stop.is_set():
                 index = await ticker.wait()
                 wake = Wake(index, ticker.stamp, ticker.elapsed, ticker.lateness, ticker.overruns)
@@ -204,6 +203,9 @@ class Daemon:
                 self._compute[recorder.count % len(self._compute)] = compute
                 recorder.keep(cycle.tick)
                 link.offer(cycle.tick)
+                if recorder.count == 1:
+                    self.job.ready()
+                    notifier.tell("READY=1")
                 if cycle.events:
                     self._tell_events()
                 if self._writes and self._writes[0][0] <= recorder.count:
@@ -265,7 +267,6 @@ class Daemon:
             realtime.hold_garbage(hold)
 
     async def _write_recordings(self) -> None:
-        self._write_due = asyncio.Event()
         while True:
             await self._write_due.wait()
             self._write_due.clear()

@@ -1,0 +1,135 @@
+"""Daemons for tests: a robot of its own name on a port of its own, quick movements, and a body that remembers."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from drivers.null import NullRobot
+from drivers.robot import JointCommand, Measurement
+from runtime import config, policies
+from runtime.config import Config
+from runtime.control.policy import Policy
+from runtime.control.posture import Posture
+from runtime.cycle import Wake
+from runtime.daemon import Daemon, Job
+from runtime.messages import Mode, ModeReply, Request
+from station.session import Station, connected
+
+_numbers = itertools.count()
+QUICK = {
+    "posture.soft_start": 0.05,
+    "posture.fold_time": 0.05,
+    "posture.rise_time": 0.05,
+    "posture.settle_time": 0.01,
+    "posture.blend_time": 0.02,
+    "damp.deadline": 0.3,
+    "recorder.seconds": 2.0,
+    "recorder.after_fault": 0.02,
+}
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def make_config(**changes: Any) -> Config:
+    """Stoch3 under a name of its own; keys with ``__`` for the dot."""
+    named = {key.replace("__", "."): value for key, value in changes.items()}
+    own = {"robot.name": f"test-{os.getpid()}-{next(_numbers)}", "link.listen": [free_endpoint()]}
+    return config.override(config.load(config.find_robot("stoch3")), "test", QUICK | own | named)
+
+
+def make_policy(robot: str = "stoch3") -> Policy:
+    policy = policies.load(policies.find_policy("balance"), "stoch3")
+    return msgspec.structs.replace(policy, robot=robot)
+
+
+class Probe(NullRobot):
+    """The null body, remembering every command, doing what a test asks before it answers."""
+
+    def __init__(self, made: Config) -> None:
+        super().__init__(Posture(made.robot, made.control, made.posture).folded_joints)
+        self.commands: list[JointCommand] = []
+        self.closed = False
+        self.before: Callable[[Probe], None] = lambda _probe: None
+        self.change: Callable[[Measurement], Measurement] = lambda measurement: measurement
+
+    async def exchange(self, command: JointCommand) -> Measurement:
+        self.commands.append(command)
+        self.before(self)
+        return self.change(await super().exchange(command))
+
+    async def close(self) -> None:
+        self.closed = True
+        await super().close()
+
+
+def is_damp(command: JointCommand) -> bool:
+    return not command.kp.any() and not command.torque.any() and bool((command.kd > 0).all())
+
+
+class Served:
+    """A daemon in this process and a client beside it; the client's calls run on a thread, as another process would."""
+
+    def __init__(self, made: Config, folder: Path, body: Probe | None = None) -> None:
+        self.config = made
+        self.body = body or Probe(made)
+        self.ready = asyncio.Event()
+        job = Job(made, "# test", make_policy(made.robot.name), self.body, folder, ready=lambda: self.ready.set())
+        self.daemon = Daemon(job)
+
+    async def __aenter__(self) -> Served:
+        self.task = asyncio.get_running_loop().create_task(self.daemon.run())
+        waiting = asyncio.get_running_loop().create_task(self.ready.wait())
+        await asyncio.wait((self.task, waiting), return_when=asyncio.FIRST_COMPLETED)
+        if self.task.done():
+            waiting.cancel()
+            await self.task
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.daemon.stop()
+        await asyncio.gather(self.task, return_exceptions=True)
+
+    async def client(self, act: Callable[[Station], Any]) -> Any:
+        def run() -> Any:
+            with connected(self.config.robot.name, self.config.link.listen[0]) as station:
+                return act(station)
+
+        return await asyncio.to_thread(run)
+
+    async def ask(self, word: str) -> ModeReply:
+        reply: ModeReply = await self.client(
+            lambda station: station.ask_for(ModeReply, station.keys.mode, word.encode())
+        )
+        return reply
+
+    async def reach(self, mode: Mode) -> None:
+        async with asyncio.timeout(20):
+            while self.daemon.cycle.state.mode is not mode:
+                await asyncio.sleep(0.005)
+
+    async def stand(self) -> None:
+        for wish in (Request.ARM, Request.STAND):
+            assert self.daemon.take_request(wish).accepted
+        await self.reach(Mode.STAND)
+
+    async def walk(self) -> None:
+        await self.stand()
+        assert self.daemon.take_request(Request.WALK).accepted
+        await asyncio.sleep(0.05)
+
+
+def wake(index: int, rate_hz: float = 200.0) -> Wake:
+    """The tick at ``index`` periods, on time."""
+    return Wake(index, index / rate_hz, 1.0 / rate_hz, 0.0, 0)

@@ -1,0 +1,196 @@
+"""The guard against injected faults: every one is named, placed and leads to damp; torque never passes the peak."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from daemons import make_config
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.robot import JointCommand, JointState, motor_torque
+from runtime.control.records import Clamp, Records
+from runtime.limits import Guard, tilt
+from runtime.messages import TICK_DTYPE
+from runtime.modes import Reason
+
+CONFIG = make_config()
+GUARD = Guard(CONFIG.robot, CONFIG.limits, 200.0)
+PEAK = np.array(CONFIG.robot.joints.peak_torque)
+
+
+def healthy() -> Records:
+    tick = np.zeros(1, TICK_DTYPE)
+    tick["orientation"][0, 0] = 1.0
+    tick["linear_acceleration"][0, 2] = 9.81
+    tick["joint_temperature"] = 30.0
+    tick["voltage"] = 48.0
+    tick["joint_position"][0, :, 2] = -2.0
+    tick["measured_stamp"] = tick["imu_stamp"] = 10.0
+    return tick
+
+
+def put(name: str, index: Any, value: float) -> Callable[[Records], None]:
+    def act(tick: Records) -> None:
+        tick[name][index] = value
+
+    return act
+
+
+def lean(tick: Records) -> None:
+    tick["orientation"][0] = (math.cos(0.5), math.sin(0.5), 0.0, 0.0)
+
+
+INJECTED = [
+    (put("joint_fault", (0, 2, 1), 5), Reason.MOTOR_FAULT, "BL hip: a motor reports a fault (code 5)"),
+    (put("joint_temperature", (0, 0, 2), 81.0), Reason.HOT_MOTOR, "FL knee: a motor is too hot (81 °C, bound 80)"),
+    (put("joint_velocity", (0, 3, 0), -30.5), Reason.JOINT_SPEED, "BR abduction: a joint is too fast (-30.5 rad/s"),
+    (put("joint_age", (0, 1, 1), 0.04), Reason.STALE_MOTOR, "FR hip: a motor's reply is too old (40 ms, bound 30)"),
+    (put("imu_stamp", 0, 9.9), Reason.STALE_IMU, "(100 ms, bound 30)"),
+    (put("orientation", (0, 0), 0.8), Reason.IMPLAUSIBLE_IMU, "cannot be"),
+    (put("angular_velocity", (0, 2), 21.0), Reason.IMPLAUSIBLE_IMU, "cannot be"),
+    (put("linear_acceleration", (0, 0), 500.0), Reason.IMPLAUSIBLE_IMU, "cannot be"),
+    (lean, Reason.TILTED, "(1.00 rad, bound 0.9)"),
+]
+
+
+def test_a_healthy_measurement_passes() -> None:
+    assert GUARD.judge(healthy()) is Reason.OK
+    assert GUARD.arming_problems(healthy()) == []
+
+
+@pytest.mark.parametrize(("inject", "reason", "words"), INJECTED, ids=lambda part: getattr(part, "name", None))
+def test_an_injected_fault_is_named(inject: Callable[[Records], None], reason: Reason, words: str) -> None:
+    tick = healthy()
+    inject(tick)
+    assert GUARD.judge(tick) is reason
+    assert words in GUARD.explain(reason, tick)
+
+
+MEASURED = [
+    "orientation",
+    "angular_velocity",
+    "linear_acceleration",
+    "joint_position",
+    "joint_velocity",
+    "joint_torque",
+    "joint_temperature",
+    "joint_age",
+    "voltage",
+    "imu_stamp",
+]
+
+
+@pytest.mark.parametrize("name", MEASURED)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_whatever_is_not_a_number_is_seen(name: str, value: float) -> None:
+    for index in np.ndindex(healthy()[name].shape):
+        tick = healthy()
+        tick[name][index] = value
+        assert GUARD.judge(tick) is not Reason.OK, (name, index)
+
+
+def test_low_voltage() -> None:
+    config = make_config(limits__min_voltage=40.0, limits__arming_voltage=44.0)
+    guard = Guard(config.robot, config.limits, 200.0)
+    tick = healthy()
+    tick["voltage"] = 39.0
+    assert guard.judge(tick) is Reason.LOW_VOLTAGE
+    assert "39.0 V, bound 40" in guard.explain(Reason.LOW_VOLTAGE, tick)
+    tick["voltage"] = 42.0
+    assert guard.judge(tick) is Reason.OK
+    assert guard.arming_problems(tick) == ["supply 42.0 V, bound 44"]
+
+
+@pytest.mark.parametrize(("torque", "trips"), [(17.0, False), (19.0, True), (36.0, True)])
+def test_the_continuous_rating_holds_for_the_rms(torque: float, trips: bool) -> None:
+    guard = Guard(CONFIG.robot, CONFIG.limits, 200.0)
+    tick = healthy()
+    tick["joint_torque"][0, 1, 2] = torque
+    ticks = math.inf
+    for count in range(200 * 120):
+        if guard.judge(tick) is Reason.OVERLOAD:
+            ticks = count
+            break
+    assert (ticks < math.inf) == trips
+    if trips:  # the first-order low-pass reaches the bound when 1 - exp(-t/T) = (18/torque)²
+        expected = -CONFIG.limits.thermal_time * math.log(1.0 - (18.0 / torque) ** 2)
+        assert ticks / 200.0 == pytest.approx(expected, rel=0.01)
+        assert "FR knee" in guard.explain(Reason.OVERLOAD, tick)
+
+
+numbers = st.floats(-60.0, 60.0)
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(numbers, min_size=12, max_size=12),
+    st.floats(0, 400),
+    st.floats(0, 10),
+    st.lists(st.floats(-2, 2), min_size=12, max_size=12),
+)
+def test_the_law_with_the_bounded_command_stays_within_the_peak(
+    torque: list[float], kp: float, kd: float, error: list[float]
+) -> None:
+    tick = healthy()
+    tick["command_torque"] = np.reshape(torque, (4, 3))
+    tick["command_position"] = np.reshape(error, (4, 3))
+    tick["command_kp"], tick["command_kd"] = kp, kd
+    asked = _law(tick)
+    assert GUARD.bound(tick) is Reason.OK
+    given_ = _law(tick)
+    np.testing.assert_allclose(given_, np.clip(asked, -PEAK, PEAK), atol=1e-9)
+    assert bool(tick["clamps"][0] & Clamp.TORQUE) == bool((np.abs(asked) > PEAK).any())
+
+
+def _law(tick: Records) -> np.ndarray:
+    t = tick[0]
+    fields = ("position", "velocity", "kp", "kd", "torque")
+    command = JointCommand(*(t[f"command_{name}"] for name in fields))
+    joints = JointState(
+        *(t[f"joint_{name}"] for name in ("position", "velocity", "torque", "temperature", "fault", "age"))
+    )
+    return motor_torque(command, joints)
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "kp", "kd", "torque"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_command_that_is_not_finite_is_refused(name: str, value: float) -> None:
+    for index in np.ndindex(4, 3):
+        tick = healthy()
+        tick["command_kp"] = tick["command_kd"] = 1.0
+        tick[f"command_{name}"][0][index] = value
+        assert GUARD.bound(tick) is Reason.BAD_COMMAND
+
+
+def test_a_negative_gain_is_refused() -> None:
+    tick = healthy()
+    tick["command_kp"][0, 1, 1] = -1.0
+    assert GUARD.bound(tick) is Reason.BAD_COMMAND
+
+
+def test_arming_names_every_obstacle() -> None:
+    tick = healthy()
+    tick["orientation"][0] = (math.cos(0.2), 0.0, math.sin(0.2), 0.0)
+    tick["joint_temperature"][0, 0, 0] = 70.0
+    tick["joint_position"][0, 3, 2] = 1.0
+    problems = GUARD.arming_problems(tick)
+    assert len(problems) == 3
+    assert problems[0].startswith("tilted 0.40 rad")
+    assert problems[1] == "hottest motor 70 °C, bound 65"
+    assert problems[2].startswith("BR knee at 1.00 rad, range -2.9 to")
+    assert GUARD.judge(tick) is Reason.OK
+
+
+@given(st.floats(0, 3.1), st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi))
+def test_tilt_does_not_depend_on_heading(angle: float, axis: float, yaw: float) -> None:
+    half, turn = angle / 2, yaw / 2
+    about = np.array([math.cos(half), math.sin(half) * math.cos(axis), math.sin(half) * math.sin(axis), 0.0])
+    w, x, y, _ = about
+    c, s = math.cos(turn), math.sin(turn)
+    turned = np.array([c * w, c * x - s * y, c * y + s * x, s * w])
+    assert tilt(turned) == pytest.approx(angle, abs=1e-6)
