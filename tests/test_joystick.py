@@ -1,0 +1,302 @@
+"""Hands to robot: event bytes through a pipe, the driver's rules, and what a lost driver does to a walking robot."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import struct
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import pytest
+from daemons import Served, make_config
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.messages import Mode, Request
+from station.driving import STILL, Driving
+from station.joystick import Joystick
+from station.keyboard import HOLD_SECONDS, Keys
+from station.pad import EVENT, Pad, PadDevice, SourceLost, Sticks, load_mapping, shipped_mappings
+from station.session import Station, StationError
+
+XPAD = dict(shipped_mappings())["xpad"]
+FORWARD, TURN, LEFT = 1, 0, 3
+BUMPER, B, BACK = 311, 305, 314
+SHARE = st.floats(-1, 1)
+STICKS = st.builds(Sticks, forward=SHARE, left=SHARE, turn=SHARE, held=st.booleans())
+Script = Callable[[Served, int], Awaitable[None]]
+MODES = st.sampled_from([*Mode, None])
+
+
+def event(kind: int, code: int, value: int) -> bytes:
+    return struct.pack("@llHHi", 12, 34, kind, code, value)
+
+
+def axis(code: int, value: int) -> bytes:
+    return event(3, code, value)
+
+
+def button(code: int, value: int = 1) -> bytes:
+    return event(1, code, value)
+
+
+REPORT, DROPPED = event(0, 0, 0), event(0, 3, 0)
+CENTRED = axis(FORWARD, 0) + axis(TURN, 0) + axis(LEFT, 0) + REPORT
+
+
+# The pad -------------------------------------------------------------------------------------------------------------
+
+
+def test_an_event_is_twenty_four_bytes_on_this_machine() -> None:
+    assert EVENT.size == 24
+
+
+def test_sticks_are_unknown_until_every_axis_has_spoken() -> None:
+    pad = Pad(XPAD)
+    pad.feed(axis(FORWARD, 0) + axis(TURN, 0))
+    assert pad.sticks is None
+    pad.feed(axis(LEFT, 0))
+    assert pad.sticks == Sticks()
+
+
+def test_up_is_forward_and_left_is_left_and_the_bumper_holds() -> None:
+    pad = Pad(XPAD)
+    pad.feed(axis(FORWARD, -32768) + axis(TURN, -32768) + axis(LEFT, -32768) + button(BUMPER))
+    assert pad.sticks == Sticks(forward=1.0, left=1.0, turn=1.0, held=True)
+    pad.feed(button(BUMPER, 0))
+    assert pad.sticks is not None and not pad.sticks.held
+
+
+@given(st.binary(max_size=30), st.lists(st.integers(1, 30), max_size=20))
+def test_bytes_cut_anywhere_mean_the_same(noise: bytes, cuts: list[int]) -> None:
+    data = CENTRED + axis(FORWARD, -20000) + button(B) + REPORT + button(BUMPER) + button(BACK) + noise
+    whole, parts = Pad(XPAD), Pad(XPAD)
+    wanted = whole.feed(data)
+    got = []
+    for cut in cuts:
+        got += parts.feed(data[:cut])
+        data = data[cut:]
+    got += parts.feed(data)
+    assert (got, parts.sticks) == (wanted, whole.sticks)
+    assert got[:2] == ["walk", "idle"]
+
+
+def test_lost_events_make_the_sticks_unknown_and_release_the_dead_man() -> None:
+    pad = Pad(XPAD)
+    pad.feed(CENTRED + button(BUMPER) + REPORT)
+    assert pad.feed(DROPPED + axis(FORWARD, -32768) + button(B) + REPORT) == []
+    assert pad.sticks is None
+    pad.feed(CENTRED)
+    assert pad.sticks == Sticks(held=False)
+
+
+@given(st.integers(-(2**31), 2**31 - 1), st.integers(-(2**31), 2**31 - 1))
+def test_a_stick_never_asks_for_more_than_all(value: int, other: int) -> None:
+    pad = Pad(XPAD)
+    pad.feed(CENTRED + axis(FORWARD, value) + axis(LEFT, other))
+    sticks = pad.sticks
+    assert sticks is not None
+    assert -1 <= sticks.forward <= 1 and -1 <= sticks.left <= 1
+    assert abs(value) > 32768 * XPAD.dead_zone * 0.99 or sticks.forward == 0
+
+
+@pytest.mark.parametrize("name", [name for name, _ in shipped_mappings()])
+def test_shipped_mappings_give_every_stick_and_button_a_code_of_its_own(name: str) -> None:
+    mapping = dict(shipped_mappings())[name]
+    codes = [getattr(mapping.buttons, field) for field in mapping.buttons.__struct_fields__]
+    assert len(set(codes)) == len(codes)
+    assert len({mapping.axes.forward.code, mapping.axes.left.code, mapping.axes.turn.code}) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = [", "Invalid value|x"),
+        ("[axes]", "forward|required"),
+        ("nonsense = 1", "nonsense"),
+        ("dead_zone = 1.5", "dead_zone|<"),
+    ],
+)
+def test_a_mapping_that_cannot_be_used_is_refused_by_name(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "pad.toml"
+    path.write_text(text)
+    with pytest.raises(StationError, match=words) as refused:
+        load_mapping(path)
+    assert str(path) in str(refused.value)
+
+
+@pytest.fixture
+def fifo(tmp_path: Path) -> Iterator[tuple[Path, int]]:
+    path = tmp_path / "event0"
+    os.mkfifo(path)
+    fd = os.open(path, os.O_RDWR)
+    yield path, fd
+    os.close(fd)
+
+
+def test_a_pad_that_is_pulled_out_is_lost(fifo: tuple[Path, int]) -> None:
+    path, fd = fifo
+    device = PadDevice(path, XPAD)
+    assert device.read() == []
+    os.write(fd, CENTRED + button(B))
+    assert device.read() == ["walk"]
+    assert device.sticks == Sticks()
+    device.close()
+    with pytest.raises(SourceLost, match="No such file"):
+        PadDevice(path.with_name("event1"), XPAD)
+
+
+# The keyboard --------------------------------------------------------------------------------------------------------
+
+
+def test_a_key_counts_as_held_only_while_it_repeats() -> None:
+    now = 0.0
+    keys = Keys(lambda: now)
+    keys.feed(b"9w")
+    assert keys.sticks.forward == 1.0
+    now = HOLD_SECONDS
+    assert keys.sticks.centred
+
+
+@given(st.binary(max_size=50))
+def test_any_bytes_from_the_terminal_are_borne(data: bytes) -> None:
+    keys = Keys()
+    for name in keys.feed(data):
+        assert Driving.requests(name, keys.sticks, armed=False)
+    assert all(abs(share) <= 1 for share in (keys.sticks.forward, keys.sticks.left, keys.sticks.turn))
+
+
+# The rules -----------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.tuples(st.one_of(st.none(), STICKS), MODES), max_size=60))
+def test_nothing_moves_before_the_sticks_were_centred_nor_without_the_dead_man(
+    script: list[tuple[Sticks | None, Mode | None]],
+) -> None:
+    driving = Driving(1.0, 1.0, 1.0)
+    centred_since_loss = False
+    for sticks, mode in script:
+        velocity = driving.velocity(sticks, mode)
+        if mode is not Mode.WALK or sticks is None or (not sticks.held and not sticks.centred):
+            centred_since_loss = False
+        elif sticks.centred:
+            centred_since_loss = True
+        if mode is not Mode.WALK:
+            assert velocity is None
+        elif sticks is None or not sticks.held or not centred_since_loss:
+            assert velocity == STILL
+        else:
+            assert velocity == (sticks.forward, sticks.left, sticks.turn)
+
+
+def test_standing_up_arms_only_with_the_dead_man_held() -> None:
+    assert Driving.requests("stand", Sticks(held=False), armed=False) == [Request.STAND]
+    assert Driving.requests("stand", None, armed=False) == [Request.STAND]
+    assert Driving.requests("stand", Sticks(held=True), armed=False) == [Request.ARM, Request.STAND]
+    assert Driving.requests("idle", None, armed=True) == [Request.DAMP]
+
+
+# With a daemon -------------------------------------------------------------------------------------------------------
+
+
+def drive(station: Station, path: Path, done: asyncio.Event) -> list[str]:
+    """A joystick on its own thread until ``done``; returns what it had to say."""
+    joystick = Joystick(station, Driving(0.5, 0.4, 1.0))
+    said: list[str] = []
+
+    def note(seen: Joystick) -> None:
+        if not said or said[-1] != seen.words:
+            said.append(seen.words)
+
+    joystick.run(lambda: PadDevice(path, XPAD), note, lambda: not done.is_set())
+    return said
+
+
+async def _until(fact: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not fact():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+def _serve_and_drive(tmp_path: Path, fifo: tuple[Path, int], script: Script) -> list[str]:
+    path, fd = fifo
+
+    async def play() -> list[str]:
+        async with Served(make_config(), tmp_path) as served:
+            done = asyncio.Event()
+            loop = asyncio.get_running_loop()
+            driver = loop.create_task(served.client(lambda station: drive(station, path, done)))
+            try:
+                await script(served, fd)
+            finally:
+                done.set()
+                said: list[str] = await driver
+            return said
+
+    return asyncio.run(play())
+
+
+def _asked(served: Served) -> list[float]:
+    return [round(value, 6) for value in served.daemon.cycle.tick["asked_velocity"][0].tolist()]
+
+
+def test_buttons_stand_it_up_and_sticks_walk_it_once_they_were_centred(tmp_path: Path, fifo: tuple[Path, int]) -> None:
+    async def script(served: Served, fd: int) -> None:
+        os.write(fd, axis(FORWARD, -32768) + axis(TURN, 0) + axis(LEFT, 0) + button(BUMPER) + button(308) + REPORT)
+        await served.reach(Mode.STAND)
+        os.write(fd, button(B))
+        await served.reach(Mode.WALK)
+        await asyncio.sleep(0.3)
+        assert _asked(served) == [0.0, 0.0, 0.0], "the stick was never centred"
+        os.write(fd, axis(FORWARD, 0) + REPORT)
+        await asyncio.sleep(0.1)
+        os.write(fd, axis(FORWARD, -32768) + REPORT)
+        await _until(lambda: _asked(served) == [0.5, 0.0, 0.0])
+        os.write(fd, button(BUMPER, 0))
+        await _until(lambda: _asked(served) == [0.0, 0.0, 0.0])
+
+    said = _serve_and_drive(tmp_path, fifo, script)
+    assert any(words.startswith("walk: ") for words in said)
+
+
+def test_a_refusal_is_shown_with_its_reason(tmp_path: Path, fifo: tuple[Path, int]) -> None:
+    async def script(served: Served, fd: int) -> None:
+        os.write(fd, CENTRED + button(B))
+        await _until(lambda: any(event.kind == "refused" for event in served.daemon.link.history))
+        await asyncio.sleep(0.2)
+
+    said = _serve_and_drive(tmp_path, fifo, script)
+    assert "walk: refused: not standing: ask for stand first" in said
+
+
+def test_a_driver_that_leaves_makes_a_walking_robot_stand(tmp_path: Path) -> None:
+    async def play() -> None:
+        async with Served(make_config(command__stand_after=60.0), tmp_path) as served:
+
+            def hold_token(station: Station) -> None:
+                token = station.session.liveliness().declare_token(f"{station.keys.operator}/1")
+                asyncio.run_coroutine_threadsafe(served.walk(), loop).result(20)
+                assert served.daemon.cycle.state.mode is Mode.WALK
+                del token
+
+            loop = asyncio.get_running_loop()
+            await served.client(hold_token)
+            await served.reach(Mode.STAND)
+            assert any(event.text == "the operator is gone" for event in served.daemon.link.history)
+
+    asyncio.run(play())
+
+
+def test_a_driver_that_leaves_moves_nothing_that_does_not_walk(tmp_path: Path) -> None:
+    async def play() -> None:
+        async with Served(make_config(), tmp_path) as served:
+            await _until(lambda: served.daemon.recorder.count > 2)
+            assert served.daemon.take_request(Request.ARM).accepted
+            await served.client(
+                lambda station: station.session.liveliness().declare_token(f"{station.keys.operator}/1").undeclare()
+            )
+            await asyncio.sleep(0.2)
+            assert served.daemon.cycle.state.mode is Mode.DAMP
+
+    asyncio.run(play())
