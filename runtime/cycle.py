@@ -26,6 +26,10 @@ from runtime.modes import Answer, ModeState, Reason
 EVENTS = 256
 """Events that wait for the link at most; the oldest go first."""
 
+_DAMP, _STAND_UP, _STAND, _WALK, _SIT_DOWN = Mode  # an enum's attribute costs a microsecond before Python 3.12
+_OK, _NOT_FINITE, _SOLVER_FAILED = Reason.OK, Reason.NOT_FINITE, Reason.SOLVER_FAILED
+_FAILED = int(SolverStatus.FAILED)
+_EXPIRED = int(Clamp.EXPIRED)
 _COMMAND_FIELDS = ("position", "velocity", "kp", "kd", "torque")
 _PLAN_FIELDS = ("velocity_command", "observation", "asked", "action", "phase", "stance", "touchdown", "foot_targets")
 _BLANK_FIELDS = (*_PLAN_FIELDS, "target_wrench", "grf", "solver_status", "clamps")
@@ -63,9 +67,9 @@ class Cycle:
         """What happened and was not yet told."""
         self.generation = 1
         """Number of policies that were active so far."""
-        self.clamps = np.zeros(len(Clamp), np.int64)
+        self.clamps = [0] * len(Clamp)
         """How often each clamp acted."""
-        self.solver = np.zeros(len(SolverStatus), np.int64)
+        self.solver = [0] * len(SolverStatus)
         """How often each solver status came, in ticks that stepped the controller."""
         control = self.tick.view(np.uint8)[CONTROL_OFFSET:].view(CONTROL_DTYPE)
         self.controller = Controller(config.robot, config.control, policy, control)
@@ -79,7 +83,9 @@ class Cycle:
         self._rest = VelocityCommand()
         self._verdict = Reason.NOT_READY
         self._problems: Sequence[str] = ()
+        self._row = self.tick[0]  # a view: what is written into it is in the record
         self._views = {name: self.tick[name][0] for name in TICK_DTYPE.names or () if self.tick[name].ndim > 1}
+        self._command_views = tuple(self._views[f"command_{name}"] for name in _COMMAND_FIELDS)
 
     @property
     def policy(self) -> Policy:
@@ -159,15 +165,15 @@ class Cycle:
         self.events.append(Event(stamp=float(tick["stamp"]), tick=int(tick["index"]), kind=kind, text=text))
 
     def _begin(self, wake: Wake) -> None:
-        t = self.tick
-        t["index"], t["stamp"], t["period"] = wake.index, wake.stamp, wake.elapsed
-        t["lateness"], t["overruns"], t["policy"] = wake.lateness, wake.overruns, self.generation
-        t["clamps"] = 0
+        row = self._row
+        row["index"], row["stamp"], row["period"] = wake.index, wake.stamp, wake.elapsed
+        row["lateness"], row["overruns"], row["policy"] = wake.lateness, wake.overruns, self.generation
+        row["clamps"] = 0
 
     def _note_measurement(self, measurement: Measurement) -> None:
-        t, views = self.tick, self._views
+        row, views = self._row, self._views
         imu, joints = measurement.imu, measurement.joints
-        t["measured_stamp"], t["imu_stamp"], t["voltage"] = measurement.stamp, imu.stamp, measurement.voltage
+        row["measured_stamp"], row["imu_stamp"], row["voltage"] = measurement.stamp, imu.stamp, measurement.voltage
         views["orientation"][:] = imu.orientation
         views["angular_velocity"][:] = imu.angular_velocity
         views["linear_acceleration"][:] = imu.linear_acceleration
@@ -180,19 +186,19 @@ class Cycle:
 
     def _source(self, wake: Wake, measurement: Measurement) -> JointCommand:
         """This mode's command, before bounds."""
-        match self.state.mode:
-            case Mode.DAMP:
-                if self._verdict is not Reason.NOT_FINITE:
-                    self.controller.estimate(measurement)
-                return self._damp
-            case Mode.STAND_UP | Mode.SIT_DOWN:
+        mode = self.state.mode
+        if mode is _DAMP:
+            if self._verdict is not _NOT_FINITE:
                 self.controller.estimate(measurement)
-                return self._blended(self.posture.step())
-            case Mode.STAND:
-                command = self.controller.step(measurement, self._rest, True)
-            case Mode.WALK:
-                command = self._walk(wake.stamp, measurement)
-        self.solver[self.tick["solver_status"][0]] += 1
+            return self._damp
+        if mode is _STAND_UP or mode is _SIT_DOWN:
+            self.controller.estimate(measurement)
+            return self._blended(self.posture.step())
+        if mode is _STAND:
+            command = self.controller.step(measurement, self._rest, True)
+        else:
+            command = self._walk(wake.stamp, measurement)
+        self.solver[int(self._row["solver_status"])] += 1
         return self._blended(command)
 
     def _walk(self, now: float, measurement: Measurement) -> JointCommand:
@@ -201,7 +207,7 @@ class Cycle:
         command = self.controller.step(measurement, self._rest if expired else self._velocity, False)
         if expired:
             self._velocity = VelocityCommand(stamp=self._velocity.stamp)
-            self.tick["clamps"] |= np.uint32(Clamp.EXPIRED)
+            self._row["clamps"] = int(self._row["clamps"]) | _EXPIRED
         return command
 
     def _blended(self, command: JointCommand) -> JointCommand:
@@ -213,32 +219,38 @@ class Cycle:
 
     def _bounded(self, command: JointCommand, measurement: Measurement) -> JointCommand:
         """The command with its torque cut, or damp when it cannot be trusted."""
-        if self.state.mode is Mode.DAMP:
+        mode = self.state.mode
+        if mode is _DAMP:
             return self._damp
-        if self.state.mode in (Mode.STAND, Mode.WALK) and self.tick["solver_status"][0] == SolverStatus.FAILED:
-            self._fail(Reason.SOLVER_FAILED, Reason.SOLVER_FAILED.words)
+        if (mode is _STAND or mode is _WALK) and int(self._row["solver_status"]) == _FAILED:
+            self._fail(_SOLVER_FAILED, _SOLVER_FAILED.words)
             return self._damp
-        for name in _COMMAND_FIELDS:
-            self._views[f"command_{name}"][:] = getattr(command, name)
+        self._write(command)
         reason = self.guard.bound(self.tick)
-        if reason is not Reason.OK:
+        if reason is not _OK:
             self._fail(reason, reason.words)
             return self._damp
-        torque = self._views["command_torque"].copy()
+        torque = self._command_views[4].copy()
         return JointCommand(command.position, command.velocity, command.kp, command.kd, torque)
 
+    def _write(self, command: JointCommand) -> None:
+        position, velocity, kp, kd, torque = self._command_views
+        position[:], velocity[:], kp[:] = command.position, command.velocity, command.kp
+        kd[:], torque[:] = command.kd, command.torque
+
     def _note_command(self, command: JointCommand) -> None:
-        t = self.tick
-        for name in _COMMAND_FIELDS:
-            self._views[f"command_{name}"][:] = getattr(command, name)
-        t["mode"], t["armed"], t["reason"] = self.state.mode, self.state.armed, self.state.reason
-        walking = self._velocity if self.state.mode is Mode.WALK else self._rest
-        asked = self._views["asked_velocity"]
-        asked[:2], asked[2] = walking.linear, walking.yaw_rate
-        bits = int(t["clamps"][0])
-        if bits:
-            for index in range(len(self.clamps)):
-                self.clamps[index] += bits >> index & 1
+        if command is self._damp:
+            self._write(command)
+        row, state = self._row, self.state
+        row["mode"], row["armed"], row["reason"] = int(state.mode), state.armed, int(state.reason)
+        asked = self._velocity if state.mode is _WALK else self._rest
+        vector = self._views["asked_velocity"]
+        vector[:2], vector[2] = asked.linear, asked.yaw_rate
+        bits = int(row["clamps"])
+        while bits:
+            lowest = bits & -bits
+            self.clamps[lowest.bit_length() - 1] += 1
+            bits ^= lowest
         self._command = command
 
     def _fail(self, reason: Reason, words: str) -> None:
