@@ -95,5 +95,78 @@ def joystick(
             drive(station, known.control.bounds, keyboard, pad, mapping, speed)
 
 
+@app.command()
+def monitor(
+    robot: RobotOption = "stoch3",
+    connect: ConnectOption = ENDPOINT,
+    json: Annotated[bool, typer.Option("--json", help="A line of JSON each time.")] = False,
+    hz: Annotated[float, typer.Option(min=0.1, max=20, help="How often.")] = 2.0,
+    count: Annotated[int, typer.Option(help="Stop after so many; 0 for never.")] = 0,
+) -> None:
+    """Asked against applied, with the reason of every clamp."""
+    from itertools import islice
+
+    import msgspec
+    import numpy as np
+    from rich.console import Console
+
+    from runtime import config
+    from station.monitor import draw_table, watch
+    from station.session import connected
+
+    with refusals():
+        known = config.load(config.find_robot(robot))
+        peak = np.array(known.robot.joints.peak_torque)
+        screen = Console()
+        with connected(known.robot.name, connect) as station:
+            for summary in islice(watch(station, peak, hz), count or None):
+                if json:
+                    typer.echo(msgspec.json.encode(summary).decode())
+                    continue
+                if screen.is_terminal:
+                    screen.clear()
+                screen.print("no ticks" if summary is None else draw_table(summary))
+
+
+@app.command()
+def health(
+    robot: RobotOption = "stoch3",
+    connect: ConnectOption = ENDPOINT,
+    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    seconds: Annotated[float, typer.Option(min=0.2, help="How long to look.")] = 2.0,
+) -> None:
+    """Whether the robot is in order. Exit code 0: yes, 1: a warning, 2: no, or nobody answers."""
+    import msgspec
+
+    from runtime import config
+    from runtime.config import ConfigError
+    from station.monitor import Level, examine, gather
+    from station.session import StationError, connected
+
+    try:
+        known = config.load(config.find_robot(robot))
+        with connected(known.robot.name, connect) as station:
+            status = station.next_status()
+            ticks, lost = gather(station, seconds)
+    except (ConfigError, StationError) as error:
+        typer.echo(f"trotd: {error}", err=True)
+        raise typer.Exit(2) from error
+    if len(ticks) < 2:
+        typer.echo(f"trotd: robot {known.robot.name!r} sends no ticks", err=True)
+        raise typer.Exit(2)
+    checks = examine(ticks, status, known, lost)
+    if json:
+        typer.echo(msgspec.json.encode(checks).decode())
+    else:
+        for check in checks:
+            typer.echo(f"{check.level.name.lower():8} {check.name:12} {check.words}")
+    raise typer.Exit(int(max(check.level for check in checks) if checks else Level.OK))
+
+
+def register(front: typer.Typer) -> None:
+    """Put these commands beside those of the front door."""
+    front.add_typer(app)
+
+
 if __name__ == "__main__":
     app()
