@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import msgspec
 from msgspec import Meta
 
 from drivers.description import Name, NonNegative, Positive, Record
@@ -40,7 +41,7 @@ class RunPlan(Record, frozen=True, kw_only=True):
     config: str
     """Hash of the robot's config (``training.provenance``)."""
     seed: Annotated[int, Meta(ge=0)] = 0
-    variant: str = "linear"
+    variant: Literal["linear", "linear-plain", "linear-grf", "mlp", "mlp-plain", "mlp-grf"] = "linear"
     terms: bool = True
     """The fixed terms around the matrix (method: Past the teacher); off is the paper's letter."""
     reference: Literal["rigid-body", "robot"] = "rigid-body"
@@ -50,17 +51,53 @@ class RunPlan(Record, frozen=True, kw_only=True):
     """Policy file whose numbers are the first mean; empty starts from zero."""
     stages: tuple[StagePlan, ...]
 
+    def shortened(self, iterations: int | None, directions: int | None, ticks: int | None) -> RunPlan:
+        """The same plan with other counts in every stage; None keeps the stage's own."""
+        changes = {"iterations": iterations, "directions": directions, "ticks": ticks}
+        given = {name: value for name, value in changes.items() if value is not None}
+        return msgspec.structs.replace(
+            self, stages=tuple(msgspec.structs.replace(stage, **given) for stage in self.stages)
+        )
 
-IMITATE = StagePlan(name="imitate", reward="table", iterations=20)
-IMITATE_BOTH = StagePlan(name="imitate", reward="table", iterations=20, symmetry="both")
+
+IMITATE = StagePlan(
+    name="imitate", reward="table", iterations=20, directions=32, ticks=400, conditions="noisy", symmetry="both",
+    learning_rate=0.1, learning_rate_end=0.04,
+)  # fmt: skip
+"""From nothing to a walk."""
 SERVE = StagePlan(
-    name="serve", reward="task", iterations=45, ticks=520, conditions="task", symmetry="both", stdev=0.05,
-    stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.003, fall_weight=2.5,
+    name="serve", reward="task", iterations=30, directions=48, ticks=520, conditions="task", symmetry="both",
+    stdev=0.05, stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.003, fall_weight=2.5,
 )  # fmt: skip
+"""From a walk to one that follows commands and takes pushes."""
+POLISH = msgspec.structs.replace(SERVE, name="polish", iterations=60, learning_rate_end=0.004)
 ROUGHEN = StagePlan(
-    name="roughen", reward="task", iterations=30, ticks=800, conditions="rough", symmetry="both", stdev=0.05,
-    stdev_learning_rate=0.0, learning_rate=0.02, learning_rate_end=0.002, fall_weight=2.5,
+    name="roughen", reward="task", iterations=40, directions=48, ticks=700, conditions="rough", symmetry="both",
+    stdev=0.05, stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.003, fall_weight=2.5,
 )  # fmt: skip
-PAPER = StagePlan(
-    name="imitate", reward="table", iterations=60, conditions="paper", symmetry="none"
-)  # fmt: skip
+PAPER = StagePlan(name="imitate", reward="table", iterations=60, conditions="imitation", symmetry="none")
+"""Section IV.B: 64 directions, 1000 ticks, 60 iterations; with the sensors' noise, without which nothing transfers."""
+
+
+def make_plan(
+    name: str,
+    robot: str,
+    config: str,
+    seed: int,
+    variant: str,
+    start: str,
+    paper: bool,
+    rough: bool,
+    reference: str = "rigid-body",
+) -> RunPlan:
+    """The plan of a ``trotd train``: both stages from nothing, the paper's letter, or fine-tuning on rough ground."""
+    stages: tuple[StagePlan, ...] = (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, POLISH)
+    if variant.endswith("plain"):  # commands mean nothing to it: it can only imitate one
+        stages = tuple(stage for stage in stages if stage.reward == "table") or stages
+    return msgspec.convert(
+        {
+            "name": name, "robot": robot, "config": config, "seed": seed, "variant": variant, "terms": not paper,
+            "start": start, "reference": reference, "stages": stages,
+        },
+        RunPlan,
+    )  # fmt: skip

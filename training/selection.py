@@ -1,0 +1,95 @@
+"""The policy that is shipped is the best on a validation set, not on the training episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import pi
+
+import msgspec
+import numpy as np
+
+from runtime import policies
+from runtime.config import Config
+from runtime.control.policy import Policy
+from sim.scenario import Push, Scenario
+from training.checkpoint import RunFolder
+from training.contest import Contender, Contest, Outcome, Trial
+from training.randomize import SENSORS, TASK, Conditions, draw
+
+CANDIDATES = 6
+"""Checkpoints that are compared: the last ones, evenly spread over the last stage."""
+SEED = 5_000
+"""Of the validation set; apart from training's and from the table's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A candidate on the validation set."""
+
+    iteration: int
+    falls: int
+    error: float
+    """Mean velocity error over the grid, m/s."""
+    task_return: float
+
+    @property
+    def score(self) -> float:
+        """Return less 50 a fall and 10 a cm/s of error: what the table asks for, in one number."""
+        return self.task_return - 50.0 * self.falls - 1000.0 * self.error
+
+
+def validation_set(draws: int = 24) -> tuple[list[Trial], list[Trial]]:
+    """Velocities that are measured, and pushes, spawns and draws that are to be survived."""
+    commands = ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (-0.4, 0.0, 0.0), (1.6, 0.0, 0.0), (0.0, 0.3, 0.0), (0.5, 0.0, 0.5))
+    measured = [Trial(Conditions(Scenario(seed=SEED, noise=SENSORS), command), 5.0) for command in commands]
+    pushed = [
+        Trial(
+            Conditions(
+                Scenario(
+                    seed=SEED + phase,
+                    noise=SENSORS,
+                    pushes=(Push(1.6 + 0.1 * phase, 0.1, (450.0 * np.cos(side), 450.0 * np.sin(side), 0.0)),),
+                ),
+                (0.4, 0.0, 0.0),
+            ),
+            3.5,
+        )
+        for phase in range(4)
+        for side in (0.0, pi / 2, pi, -pi / 2)
+    ]
+    rng = np.random.default_rng(SEED)
+    return measured, pushed + [Trial(draw(TASK, rng), 2.6) for _ in range(draws)]
+
+
+def judge(contest: Contest, who: Contender, iteration: int) -> Verdict:
+    """One candidate."""
+    measured, survived = validation_set()
+    walks = contest.play(who, measured)
+    rest: list[Outcome] = contest.play(who, survived)
+    wanted = np.array([trial.conditions.command for trial in measured])
+    errors = np.abs(np.array([outcome.velocity for outcome in walks]) - wanted)[:, :2]
+    return Verdict(
+        iteration=iteration,
+        falls=sum(outcome.fell for outcome in [*walks, *rest]),
+        error=float(errors.mean()),
+        task_return=float(np.mean([outcome.task_return for outcome in rest])),
+    )
+
+
+def select(config: Config, folder: RunFolder, workers: int, say: Callable[[str], None]) -> Policy:
+    """The best of the last stage's checkpoints, with the verdicts in its provenance."""
+    numbers = folder.iterations()
+    last_stage = [row.iteration for row in folder.curve() if row.stage == folder.curve()[-1].stage]
+    last = [number for number in numbers if number in last_stage] or numbers
+    chosen = sorted({last[round(k)] for k in np.linspace(len(last) // 3, len(last) - 1, CANDIDATES)})
+    verdicts = []
+    with Contest(config, workers) as contest:
+        for number in chosen:
+            who = Contender(f"{number}", "policy", str(folder.policy_file(number)))
+            verdicts.append(judge(contest, who, number))
+            say(f"validation of {number}: {msgspec.to_builtins(verdicts[-1])}, score {verdicts[-1].score:.0f}")
+    best = max(verdicts, key=lambda verdict: verdict.score)
+    policy = policies.load(folder.policy_file(best.iteration), config.robot.name)
+    results = [msgspec.to_builtins(verdict) for verdict in verdicts]
+    return msgspec.structs.replace(policy, provenance=policy.provenance | {"validation": results})
