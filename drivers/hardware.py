@@ -124,7 +124,7 @@ class HardwareRobot:
         """See ``Robot.exchange``.
 
         Raises:
-            BusTimeout: not one motor answered.
+            BusTimeout: not one motor answered for longer than is coasted over.
             ValueError: a number in ``command`` is not finite; nothing was sent.
         """
         if not self._connected:
@@ -137,7 +137,7 @@ class HardwareRobot:
         else:
             await self.motors.command(command)
         joints = self.motors.joint_state()
-        if joints.age.min() > self._clock() - stamp:
+        if self.motors.all_silent:
             raise BusTimeout(f"no motor answered for {joints.age.min() * 1e3:.0f} ms: supply? emergency stop? bus?")
         self._faulty = bool((~np.isin(joints.fault, _NOT_CLEARABLE)).any())
         return Measurement(stamp, self.imu.latest(), joints, self.motors.voltage)

@@ -86,8 +86,6 @@ NOT_STARTING = 17
 """Fault code of ours: a motor that gets commands but does not begin to obey."""
 SILENT = 18
 """Fault code of ours: a motor missed more replies in a row than are coasted over."""
-COASTED_TICKS = 2
-"""Replies in a row that a motor may miss: its last reading stands in."""
 START_TIME = 0.25
 """s that a motor may take from stopped to running."""
 
@@ -217,6 +215,11 @@ class Motors:
         now = self._clock()
         return [index for index, stamp in enumerate(self._stamps) if now - stamp > longer_than]
 
+    @property
+    def all_silent(self) -> bool:
+        """Whether every motor missed more replies in a row than are coasted over."""
+        return min(self._missed) > self.config.coasted_ticks
+
     def name(self, index: int) -> str:
         """``FL knee (id 13, bus 1)`` for 2."""
         return f"{LEGS[index // 3]} {JOINTS[index % 3]} (id {self._ids[index]}, bus {self._bus_of[index] + 1})"
@@ -226,7 +229,7 @@ class Motors:
         if code == RESTARTED:
             return "it restarted by itself: check supply and zero"
         if code == SILENT:
-            return f"it missed more than {COASTED_TICKS} replies in a row: cable? supply?"
+            return f"it missed more than {self.config.coasted_ticks} replies in a row: cable? supply?"
         if code == NOT_STARTING:
             return f"it gets commands but did not begin to obey within {START_TIME} s"
         return self.codec.describe_fault(code)
@@ -283,9 +286,9 @@ class Motors:
 
     def _faults(self, now: float) -> NDArray[np.int32]:
         faults = np.zeros(12, dtype=np.int32)
-        running = self.codec.running
+        running, coasted = self.codec.running, self.config.coasted_ticks
         for index, reading in enumerate(self._readings):
-            if reading[_MODE] == running and index not in self._latched and self._missed[index] <= COASTED_TICKS:
+            if reading[_MODE] == running and index not in self._latched and self._missed[index] <= coasted:
                 self._running[index] = self._commanding_since is not None
             else:
                 faults[index] = self._fault(index, int(reading[_MODE]), int(reading[_FAULT]), now)
@@ -294,7 +297,7 @@ class Motors:
     def _fault(self, index: int, mode: int, fault: int, now: float) -> int:
         if index in self._latched:
             return self._latched[index]
-        if self._missed[index] > COASTED_TICKS:
+        if self._missed[index] > self.config.coasted_ticks:
             return SILENT
         if mode == self.codec.running:
             return 0

@@ -62,6 +62,8 @@ class MotorsConfig(Record, frozen=True, kw_only=True):
     """Bound sent with every command, N·m at the joint."""
     watchdog: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.1
     """s without a command after which a motor goes limp by itself."""
+    coasted_ticks: Annotated[int, Meta(ge=0, le=10)] = 2
+    """Replies in a row that a motor may miss, its last reading standing in, before that is a fault."""
     servo_kp: Positive = 200.0
     """moteus: ``servo.pid_position.kp`` that the servos are configured with, N·m per revolution."""
     servo_kd: Positive = 10.0

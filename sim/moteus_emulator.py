@@ -68,7 +68,7 @@ class MoteusEmulator:
         """How often its watchdog ran out."""
         self._shift = 0.0
         self._command: dict[int, float] = {}
-        self._commanded_at = self._energised_at = self._now = 0.0
+        self._commanded_at = self._energised_at = self._now = self._stepped = 0.0
         self._planned = math.nan
 
     def restart(self, shift: float = 0.0) -> None:
@@ -85,7 +85,7 @@ class MoteusEmulator:
         """See ``ServoEmulator.answer``. A frame that does not parse is ignored, as the servo does."""
         if self.silent or identifier & 0x7F not in (self.id, 0x7F):
             return None
-        self.step(now)
+        self._advance(now)
         try:
             registers = parse(data)
         except CorruptFrame:
@@ -99,12 +99,8 @@ class MoteusEmulator:
 
     def step(self, now: float) -> Drive:
         """See ``ServoEmulator.step``."""
-        elapsed, self._now = now - self._now, now
-        self._check()
-        if self.mode in (Mode.ENABLING, Mode.CALIBRATING, Mode.CALIBRATION_COMPLETE):
-            if now - self._energised_at < _START_TIME:
-                return LIMP
-            self.mode = Mode.POSITION
+        elapsed, self._stepped = now - self._stepped, now
+        self._advance(now)
         if self.mode in (Mode.TIMEOUT, Mode.ZERO_VELOCITY, Mode.BRAKE):
             return Drive(kd=min(self.settings.kd / REVOLUTION, _DAMPING_TORQUE))
         if self.mode != Mode.POSITION:
@@ -118,6 +114,14 @@ class MoteusEmulator:
             step = self.settings.encoder_step
             self.position = round(position / REVOLUTION / step) * step + self._shift
             self.velocity = velocity / REVOLUTION
+
+    def _advance(self, now: float) -> None:
+        self._now = now
+        if self.mode in (Mode.STOPPED, Mode.FAULT):
+            return
+        self._check()
+        if self.mode == Mode.ENABLING and now - self._energised_at >= _START_TIME:
+            self.mode = Mode.POSITION
 
     def _obey(self, written: dict[int, float]) -> None:
         mode = written.pop(Register.MODE, None)
@@ -144,8 +148,6 @@ class MoteusEmulator:
             self.mode = Mode.POSITION
 
     def _check(self) -> None:
-        if self.mode in (Mode.STOPPED, Mode.FAULT):
-            return
         if self.temperature > self.settings.fault_temperature:
             self.fail(38)
         elif self.voltage > self.settings.max_voltage:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,6 +38,7 @@ class ServoWire:
         seed: int = 0,
     ) -> None:
         self.servos = {bus: list(members) for bus, members in servos.items()}
+        self._by_id = {(bus, servo.id): servo for bus, members in self.servos.items() for servo in members}
         self.faults = WireFaults()
         self.counters = BusCounters()
         self._clock = clock
@@ -51,7 +52,7 @@ class ServoWire:
         if bus in faults.unplugged:
             return []
         replies: list[Frame] = []
-        for servo in self.servos.get(bus, []):
+        for servo in self._addressed(bus, identifier & 0x7F):
             reply = servo.answer(identifier, data, self._clock())
             if reply is None or self._happens(faults.drop):
                 continue
@@ -80,6 +81,10 @@ class ServoWire:
             asyncio.get_running_loop().remove_reader(channel.fileno())
             channel.close()
         self._channels.clear()
+
+    def _addressed(self, bus: int, motor: int) -> Sequence[ServoEmulator]:
+        servo = self._by_id.get((bus, motor))
+        return self.servos.get(bus, ()) if servo is None else (servo,)
 
     def _readable(self, bus: int) -> None:
         for identifier, data in self._channels[bus].read():

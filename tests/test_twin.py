@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from twin_walk import TwinWalk
 
-from drivers.motors import COASTED_TICKS
 from runtime.messages import Mode, Request
 from runtime.modes import Reason
 from sim.build import build_of, lab_build, scrambled
+
+COASTED_TICKS = 2
 
 
 def test_it_walks_over_the_wires_and_knows_how_fast():
@@ -83,7 +84,7 @@ def imu_gone(walk: TwinWalk) -> None:
     [
         (silence, Reason.MOTOR_FAULT, COASTED_TICKS + 1, "FR knee"),
         (unplug, Reason.MOTOR_FAULT, COASTED_TICKS + 1, "BL"),
-        (unplug_all, Reason.BODY_SILENT, 1, "no motor answered"),
+        (unplug_all, Reason.BODY_SILENT, COASTED_TICKS + 1, "no motor answered"),
         (overheat, Reason.MOTOR_FAULT, 3, "FR hip"),
         (encoder_fault, Reason.MOTOR_FAULT, 1, "FL hip"),
         (brown_out, Reason.MOTOR_FAULT, 2, "BL"),

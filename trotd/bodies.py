@@ -17,9 +17,9 @@ from runtime.link import Channel
 from runtime.messages import Keys, SimTruth, decode_push
 
 if TYPE_CHECKING:
-    from sim.robot import SimRobot
+    from sim.world import World
 
-KINDS = ("sim", "null")
+KINDS = ("sim", "hardware", "twin", "null")
 
 
 class BodyError(ValueError):
@@ -34,13 +34,27 @@ class Body:
     channels: Callable[[Keys], Sequence[Channel]]
 
 
-def build_body(kind: str, config: Config, robot_file: Path) -> Body:
-    """The body that ``kind`` names, folded on the ground, not yet connected.
+def build_body(kind: str, config: Config, robot_file: Path, folder: Path, observe: bool = False) -> Body:
+    """The body that ``kind`` names, not yet connected; a simulated one lies folded on the ground.
+
+    Args:
+        kind: one of ``KINDS``.
+        config: of the robot.
+        robot_file: where ``config`` was read from.
+        folder: state folder, where a real body's calibration is.
+        observe: no motor is ever energised; only for bodies on wires.
 
     Raises:
-        BodyError: an unknown kind.
+        BodyError: an unknown kind, or one that cannot be observed.
+        DriverError: a body on wires without them, or without its calibration.
         ValueError: the robot's poses cannot be.
     """
+    if kind in ("hardware", "twin"):
+        from trotd.wire import wired_body
+
+        return Body(wired_body(kind, config, folder, observe), lambda _keys: ())
+    if observe:
+        raise BodyError(f"body {kind!r} has no motors that could be left alone: --observe is for hardware and twin")
     if kind == "null":
         return _null(config)
     if kind == "sim":
@@ -85,28 +99,33 @@ def _sim(config: Config, robot_file: Path) -> Body:
 
     def channels(keys: Keys) -> Sequence[Channel]:
         return (
-            Channel(keys.sim_truth, produce=lambda: _truth(robot, clock.last + period)),
-            Channel(keys.sim_push, accept=lambda data: _push(robot, data)),
+            Channel(keys.sim_truth, produce=lambda: truth_message(robot.world, clock.last + period)),
+            Channel(keys.sim_push, accept=lambda data: push_world(robot.world, data)),
         )
 
     return Body(robot, channels)
 
 
-def _truth(robot: SimRobot, stamp: float) -> bytes:
-    """The state after the last exchange, which the next measurement will be of."""
-    truth = robot.world.truth
+def truth_message(world: World, stamp: float) -> bytes:
+    """What ``sim/truth`` carries: the world's state now, which is that of ``stamp`` on the daemon's clock."""
+    truth = world.truth
     roll, pitch, yaw = _rpy(truth.rotation_body_to_world)
     forward, left = _turned(truth.linear_velocity[0], truth.linear_velocity[1], -yaw)
     x, y, z = truth.position.tolist()
     velocity = (forward, left, float(truth.angular_velocity[2]))
-    return msgspec.json.encode(SimTruth(stamp, (x, y, z), (roll, pitch, yaw), velocity, bool(robot.world.fallen())))
+    return msgspec.json.encode(SimTruth(stamp, (x, y, z), (roll, pitch, yaw), velocity, bool(world.fallen())))
 
 
-def _push(robot: SimRobot, data: bytes) -> None:
+def push_world(world: World, data: bytes) -> None:
+    """Do what a message on ``sim/push`` asks.
+
+    Raises:
+        MessageError: it asks nonsense.
+    """
     push = decode_push(data)
-    _, _, yaw = _rpy(robot.world.truth.rotation_body_to_world)
+    _, _, yaw = _rpy(world.truth.rotation_body_to_world)
     x, y = _turned(push.force[0], push.force[1], yaw)
-    robot.push((x, y, push.force[2]), push.duration)
+    world.push((x, y, push.force[2]), push.duration)
 
 
 def _rpy(rotation: Array) -> tuple[float, float, float]:

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from trotd import cli_hardware, cli_station, cli_training
+
 if TYPE_CHECKING:
     from runtime.config import Config
 
@@ -52,19 +54,19 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 @contextlib.contextmanager
 def _one_line_errors() -> Iterator[None]:
-    """Bad input ends with one line and code 2; what the robot or the link refuses with one line and code 1."""
+    """Bad input ends with one line and code 2; what the robot or the link refuses with one line and code 1.
+
+    Configuration, policy and body errors are ValueErrors; one from inside the loop would come in an ExceptionGroup.
+    """
     from drivers.errors import DriverError
-    from runtime.config import ConfigError
     from runtime.link import LinkError
-    from runtime.policies import PolicyError
     from runtime.realtime import RealtimeError
     from runtime.state import AlreadyRunning
     from station.session import StationError
-    from trotd.bodies import BodyError
 
     try:
         yield
-    except (ConfigError, PolicyError, BodyError, LinkError, AlreadyRunning, RealtimeError, ImportError) as error:
+    except (ValueError, LinkError, AlreadyRunning, RealtimeError, ImportError) as error:
         _leave(error, BAD_INPUT)
     except (DriverError, StationError, OSError) as error:
         _leave(error, FAILED)
@@ -90,7 +92,11 @@ def _load(robot: str, rate_hz: float | None, listen: list[str] | None) -> tuple[
 @app.command()
 def run(
     robot: RobotOption = "stoch3",
-    body: Annotated[str, typer.Option(help="sim: the simulator. null: no physics at all.")] = "sim",
+    body: Annotated[
+        str,
+        typer.Option(help="sim: the simulator. hardware: the robot. twin: its stand-in on wires. null: no physics."),
+    ] = "sim",
+    observe: Annotated[bool, typer.Option("--observe", help="Energise no motor, whatever is asked.")] = False,
     rate_hz: RateOption = None,
     policy: Annotated[str | None, typer.Option(help="A policy file or a shipped one's name.")] = None,
     listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on; may be given again.")] = None,
@@ -108,10 +114,9 @@ def run(
 
         config, path = _load(robot, rate_hz, listen)
         chosen = policies.load(policies.find_policy(policy or config.control.policy, path.parent), config.robot.name)
-        part = build_body(body, config, path)
-        job = daemon.Job(
-            config, path.read_text(), chosen, part.robot, folder or state_folder(), part.channels, _say_ready
-        )
+        place = folder or state_folder()
+        part = build_body(body, config, path, place, observe)
+        job = daemon.Job(config, path.read_text(), chosen, part.robot, place, part.channels, _say_ready)
         for written in daemon.main(job).recordings:
             typer.echo(f"recording: {written}")
 
@@ -126,6 +131,9 @@ def tour(
     rate_hz: RateOption = None,
     json: Annotated[bool, typer.Option("--json", help="The report as JSON, for machines.")] = False,
     policy: Annotated[str | None, typer.Option(help="A policy file or a shipped one's name.")] = None,
+    wire: Annotated[
+        bool, typer.Option("--wire", help="Over the real drivers, with the wire twin as the body.")
+    ] = False,
     folder: StateOption = None,
 ) -> None:
     """Start a daemon on the simulated body, drive it through everything it can do, and report how well it did.
@@ -139,7 +147,7 @@ def tour(
         arguments = ["--robot", str(path), "--rate-hz", str(config.control.rate_hz)]
         arguments += ["--policy", policy] if policy else []
         arguments += ["--state", str(folder)] if folder else []
-        if not take_tour(config, arguments, json):
+        if not take_tour(config, arguments, json, wire):
             raise typer.Exit(FAILED)
 
 
@@ -203,6 +211,11 @@ def damp(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOIN
 def clear(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
     """Acknowledge a fault, so that the robot can be armed again."""
     _request("clear", robot, connect)
+
+
+cli_hardware.register(app)
+cli_station.register(app)
+cli_training.register(app)
 
 
 def main() -> None:

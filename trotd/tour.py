@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import IO
 
 import msgspec
@@ -33,8 +34,10 @@ class DaemonFailed(StationError):
     """The child process did not start, or did not end, as it should."""
 
 
-def take_tour(config: Config, arguments: Sequence[str], as_json: bool) -> bool:
+def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: bool = False) -> bool:
     """Start the daemon with ``arguments``, drive it, print the report; whether it passed.
+
+    With ``wire`` the body is the wire twin, in a process of its own, behind the drivers of the real robot.
 
     Raises:
         StationError: the daemon does not start.
@@ -43,9 +46,14 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool) -> bool:
     console = Console(stderr=as_json, width=max(TABLE_WIDTH, console.width))
     with _free_endpoint() as endpoint:
         pass
-    with tempfile.TemporaryFile("w+") as output, console.status("starting the daemon") as line:
+    with contextlib.ExitStack() as stack:
+        body = "sim"
+        if wire:
+            body, arguments = "twin", stack.enter_context(_twin(config.robot.name, endpoint, arguments))
+        output = stack.enter_context(tempfile.TemporaryFile("w+"))
+        line = stack.enter_context(console.status("starting the daemon"))
         child = subprocess.Popen(
-            [sys.executable, "-m", "trotd.cli", "run", "--body", "sim", "--listen", endpoint, *arguments],
+            [sys.executable, "-m", "trotd.cli", "run", "--body", body, "--listen", endpoint, *arguments],
             stdout=output,
             stderr=subprocess.STDOUT,
         )
@@ -65,6 +73,37 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool) -> bool:
     else:
         _print(console, report)
     return report.passed
+
+
+@contextlib.contextmanager
+def _twin(robot: str, endpoint: str, arguments: Sequence[str]) -> Iterator[list[str]]:
+    """A running twin; the daemon's arguments, with the state folder that they share."""
+    from trotd.wire import MEETING, twin_folder
+
+    arguments = list(arguments)
+    with contextlib.ExitStack() as stack:
+        if "--state" not in arguments:
+            arguments += ["--state", stack.enter_context(tempfile.TemporaryDirectory(prefix="trotd-"))]
+        folder = arguments[arguments.index("--state") + 1]
+        place = twin_folder(Path(folder), robot) / MEETING
+        output = stack.enter_context(tempfile.TemporaryFile("w+"))
+        toml = arguments[arguments.index("--robot") + 1]
+        command = [sys.executable, "-m", "trotd.cli", "twin", "--robot", toml, "--state", folder, "--connect", endpoint]
+        child = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
+        try:
+            end = time.monotonic() + START_TIMEOUT
+            while not place.exists():
+                if child.poll() is not None or time.monotonic() > end:
+                    raise DaemonFailed(f"the twin did not start: {_last_line(output)}")
+                time.sleep(0.1)
+            yield arguments
+        finally:
+            child.terminate()
+            try:
+                child.wait(STOP_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
 
 
 @contextlib.contextmanager

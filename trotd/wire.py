@@ -1,0 +1,94 @@
+"""Bodies on wires: the real robot, and the wire twin that stands in for it in a process of its own.
+
+The twin's folder holds what it shares with its daemon: the link to its IMU, the UDP port of its buses, and the
+calibration of its body.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+
+from drivers import calibration
+from drivers.errors import DriverError
+from drivers.hardware import HardwareRobot
+from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
+from runtime.config import Config
+
+TWIN_REPLY_SHARE = 0.8
+"""Of a tick: how long a twin's replies are waited for. Its process shares the computer with everybody."""
+TWIN_COASTED_TICKS = 5
+"""Missed replies that are no fault of a twin: they are the computer's, which does two robots' work at once."""
+MEETING, IMU_LINK, KNOWN = "wire.json", "imu", "calibration.json"
+_GROUPS = "239.74.163.{}"
+
+
+class Wires(msgspec.Struct, frozen=True):
+    """The three sections that a robot on wires has."""
+
+    bus: BusConfig
+    motors: MotorsConfig
+    imu: ImuConfig
+
+
+def calibration_path(folder: Path, robot: str) -> Path:
+    """Where the calibration of ``robot`` is kept."""
+    return folder / "calibration" / f"{robot}.json"
+
+
+def twin_folder(folder: Path, robot: str) -> Path:
+    """Where the twin of ``robot`` and its daemon meet."""
+    return folder / "twin" / robot
+
+
+def wires_of(kind: str, config: Config, folder: Path) -> Wires:
+    """The wires of the real robot, or of its twin, before any calibration.
+
+    Raises:
+        DriverError: the robot has none, or its twin does not run.
+    """
+    wires = own_wires(config)
+    if kind == "hardware":
+        return wires
+    meeting = twin_folder(folder, config.robot.name)
+    try:
+        port = int(json.loads((meeting / MEETING).read_bytes())["port"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DriverError(f"no twin of {config.robot.name!r} in {meeting}: start it with trotd twin") from error
+    return twin_wires(wires, meeting, port, TWIN_REPLY_SHARE / config.control.rate_hz)
+
+
+def own_wires(config: Config) -> Wires:
+    """The wires that the robot's TOML names.
+
+    Raises:
+        DriverError: it names none.
+    """
+    if config.bus is None or config.motors is None or config.imu is None:
+        raise DriverError(f"robot {config.robot.name!r} has no [bus], [motors] and [imu]: it is only simulated")
+    return Wires(config.bus, config.motors, config.imu)
+
+
+def twin_wires(wires: Wires, meeting: Path, port: int, reply_timeout: float) -> Wires:
+    """The twin's: one multicast group a bus, from UDP ``port`` up, the IMU at the end of a pseudo-terminal."""
+    channels = tuple(_GROUPS.format(bus + 2) for bus in range(len(wires.bus.channels)))
+    bus = BusConfig(backend="udp_multicast", channels=channels, port=port, reply_timeout=reply_timeout)
+    motors = msgspec.structs.replace(wires.motors, coasted_ticks=TWIN_COASTED_TICKS)
+    return Wires(bus, motors, msgspec.structs.replace(wires.imu, port=str(meeting / IMU_LINK)))
+
+
+def wired_body(kind: str, config: Config, folder: Path, observe: bool) -> HardwareRobot:
+    """The drivers on the wires, with the calibration in them.
+
+    Raises:
+        DriverError: no wires, or no calibration that is valid for this robot now; observing does without one.
+    """
+    wires = wires_of(kind, config, folder)
+    meeting = twin_folder(folder, config.robot.name)
+    path = meeting / KNOWN if kind == "twin" else calibration_path(folder, config.robot.name)
+    motors, imu = wires.motors, wires.imu
+    if path.exists() or not observe:
+        motors, imu = calibration.apply(calibration.load(path, config.robot, motors), motors, imu)
+    return HardwareRobot.build(config.robot, wires.bus, motors, imu, observe=observe)
