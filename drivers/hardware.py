@@ -27,7 +27,7 @@ ANSWER_TIME = 0.5
 """s that a motor may take to answer at the start."""
 RANGE_MARGIN = 0.35
 """rad beyond its range where a joint's zero is no longer believed."""
-CLEAR_INTERVAL = 1.0
+CLEAR_INTERVAL = 0.2
 """s between attempts to bring back motors that latched, while the robot damps."""
 _NOT_CLEARABLE = (0, RESTARTED, SILENT)
 _QUESTIONS = 20

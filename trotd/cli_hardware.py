@@ -18,6 +18,7 @@ BodyOption = Annotated[str, typer.Option(help="hardware: the robot. twin: its st
 def register(app: typer.Typer) -> None:
     """Add the commands of this file to the front door."""
     app.command()(twin)
+    app.command()(check)
 
 
 @contextlib.contextmanager
@@ -59,3 +60,24 @@ def twin(
             raise ValueError(f"--product {product}: MTI-610, MTI-620 or MTI-630")
         loaded = config.load(config.find_robot(robot))
         serve_twin(loaded, folder or state_folder(), connect, TwinOptions(scramble, product, noise))  # type: ignore[arg-type]
+
+
+def check(robot: RobotOption = "stoch3", body: BodyOption = "hardware", folder: StateOption = None) -> None:
+    """Look at every motor, the IMU, the wires and this computer before anything moves; energises nothing.
+
+    Exit code 1 if anything failed.
+    """
+    with _one_line_errors():
+        import asyncio
+
+        from rich.console import Console
+
+        from runtime import config
+        from runtime.state import state_folder
+        from trotd import check as pre_flight
+
+        loaded = config.load(config.find_robot(robot))
+        rows = asyncio.run(pre_flight.check(body, loaded, folder or state_folder()))
+        console = Console()
+        if not pre_flight.show(rows, Console(width=max(console.width, 120))):
+            raise typer.Exit(FAILED)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -26,12 +27,20 @@ from station.tour import Tour, TourReport
 START_TIMEOUT = 180.0
 """s; the first start of all compiles the core."""
 STOP_TIMEOUT = 15.0
+WIRE_PRIORITY = -10
+"""Niceness of a daemon on wires, where it may: the twin's servos do not wait for it."""
+BAD_INPUT = 2
+"""The exit code by which a daemon says so."""
 TABLE_WIDTH = 132
 """Characters that the report needs; a narrower terminal wraps it."""
 
 
 class DaemonFailed(StationError):
     """The child process did not start, or did not end, as it should."""
+
+
+class DaemonRefused(DaemonFailed, ValueError):
+    """The child process did not like its input."""
 
 
 def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: bool = False) -> bool:
@@ -57,6 +66,9 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
             stdout=output,
             stderr=subprocess.STDOUT,
         )
+        if wire:
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, child.pid, WIRE_PRIORITY)
         try:
             with (
                 _reach(config.robot.name, endpoint, child, output) as station,
@@ -119,7 +131,8 @@ def _reach(robot: str, endpoint: str, child: subprocess.Popen[bytes], output: IO
     with contextlib.ExitStack() as stack:
         while True:
             if child.poll() is not None:
-                raise DaemonFailed(f"the daemon did not start: {_last_line(output)}")
+                kind = DaemonRefused if child.returncode == BAD_INPUT else DaemonFailed
+                raise kind(f"the daemon did not start: {_last_line(output)}")
             try:
                 station = stack.enter_context(connected(robot, endpoint))
                 break

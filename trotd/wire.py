@@ -33,9 +33,10 @@ class Wires(msgspec.Struct, frozen=True):
     imu: ImuConfig
 
 
-def calibration_path(folder: Path, robot: str) -> Path:
-    """Where the calibration of ``robot`` is kept."""
-    return folder / "calibration" / f"{robot}.json"
+def calibration_file(kind: str, config: Config, folder: Path) -> Path:
+    """Where the calibration of the real robot, or of its twin, is kept."""
+    name = config.robot.name
+    return twin_folder(folder, name) / KNOWN if kind == "twin" else folder / "calibration" / f"{name}.json"
 
 
 def twin_folder(folder: Path, robot: str) -> Path:
@@ -86,8 +87,7 @@ def wired_body(kind: str, config: Config, folder: Path, observe: bool) -> Hardwa
         DriverError: no wires, or no calibration that is valid for this robot now; observing does without one.
     """
     wires = wires_of(kind, config, folder)
-    meeting = twin_folder(folder, config.robot.name)
-    path = meeting / KNOWN if kind == "twin" else calibration_path(folder, config.robot.name)
+    path = calibration_file(kind, config, folder)
     motors, imu = wires.motors, wires.imu
     if path.exists() or not observe:
         motors, imu = calibration.apply(calibration.load(path, config.robot, motors), motors, imu)
