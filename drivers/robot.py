@@ -62,9 +62,12 @@ class Measurement:
     """Supply voltage, V."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class JointCommand:
-    """What one exchange takes out: the inner loop of each motor runs it until the next one."""
+    """What one exchange takes out: the inner loop of each motor runs it until the next one.
+
+    Treat it as frozen like the other records: it is not, because one is made every tick and freezing took 8 % of it.
+    """
 
     position: Array
     """Wanted joint angle, rad. Shape (4, 3)."""

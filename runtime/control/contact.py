@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from runtime.control.compilation import compiled
-from runtime.control.kinematics import gravity_of_leg
 
 SINGULAR = 1e-5
 """A leg whose Jacobian has a smaller determinant (m³) tells no force."""
 
 
 @compiled
-def foot_force(g, leg, q, torque, up, jacobian, force):  # type: ignore[no-untyped-def]
+def foot_force(gravity, torque, jacobian, force):  # type: ignore[no-untyped-def]
     """Ground on foot of one leg, body frame, N, written into ``force`` (3,): f = -J⁻ᵀ (torque - gravity).
 
-    ``up`` (3,) is the world's z axis in the body frame. Inertial forces of a swinging leg are not modelled.
+    ``gravity`` (3,) holds the leg's own links (``kinematics``). Inertial forces of a swinging leg are not modelled.
     """
-    gravity_of_leg(g, leg, q, up, force)
-    r0, r1, r2 = force[0] - torque[0], force[1] - torque[1], force[2] - torque[2]
+    r0, r1, r2 = gravity[0] - torque[0], gravity[1] - torque[1], gravity[2] - torque[2]
     determinant = 0.0
     for i in range(3):
         a, b = jacobian[(i + 1) % 3], jacobian[(i + 2) % 3]

@@ -13,7 +13,7 @@ import math
 
 from runtime.control.compilation import compiled
 from runtime.control.contact import feel_contacts, foot_force
-from runtime.control.kinematics import GRAVITY, foot_of_leg, jacobian_of_leg
+from runtime.control.kinematics import GRAVITY, foot_from_sines, gravity_from_sines, jacobian_from_sines, sines_of_leg
 
 STEEPEST = 0.4
 """Bound of the estimated slope, rise over run."""
@@ -78,14 +78,15 @@ def estimate(p, g, s, t, m):  # type: ignore[no-untyped-def]
         rotation[1, i] = -sn * to_world[0, i] + c * to_world[1, i]
         rotation[2, i] = to_world[2, i]
     for leg in range(4):
-        q = m.joints[0, leg]
-        foot_of_leg(g, leg, q, m.foot)
-        jacobian_of_leg(g, leg, q, m.jacobian[leg])
+        sines = sines_of_leg(m.joints[0, leg])
+        foot_from_sines(g, leg, sines, m.foot)
+        jacobian_from_sines(g, leg, sines, m.jacobian[leg])
+        gravity_from_sines(g, leg, sines, to_world[2], m.gravity)
         times(rotation, m.foot, t.feet[leg])
         times(to_world, m.foot, m.foot_in_world[leg])
-        foot_force(g, leg, q, m.joints[2, leg], to_world[2], m.jacobian[leg], m.force)
+        foot_force(m.gravity, m.joints[2, leg], m.jacobian[leg], m.force)
         times(rotation, m.force, t.contact_force[leg])
-        _leg_odometry(g, m, leg)
+        _leg_odometry(g, m, leg, sines)
     feel_contacts(p, s, t)
     if not s.started:
         _start(p, s, m.foot_in_world)
@@ -104,19 +105,19 @@ def estimate(p, g, s, t, m):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _leg_odometry(g, m, leg):  # type: ignore[no-untyped-def]
+def _leg_odometry(g, m, leg, sines):  # type: ignore[no-untyped-def]
     """Velocity that the body has if this foot rolls without slipping, and of the rolling foot's centre, world.
 
     A sphere's centre moves while its shank turns above the ground: 5 % of the walking speed.
     """
-    q, speed, foot, rate = m.joints[0, leg], m.joints[1, leg], m.foot, m.imu[4:7]
+    speed, foot, rate = m.joints[1, leg], m.foot, m.imu[4:7]
     x, y, z = turned(m.jacobian[leg], speed[0], speed[1], speed[2])
     x += rate[1] * foot[2] - rate[2] * foot[1]
     y += rate[2] * foot[0] - rate[0] * foot[2]
     z += rate[0] * foot[1] - rate[1] * foot[0]
     x, y, z = turned(m.to_world, x, y, z)
     bend = speed[1] + speed[2]
-    turning = rate[0] + speed[0], rate[1] + bend * math.cos(q[0]), rate[2] + bend * math.sin(q[0])
+    turning = rate[0] + speed[0], rate[1] + bend * sines[1], rate[2] + bend * sines[0]
     about_x, about_y, _ = turned(m.to_world, turning[0], turning[1], turning[2])
     m.rolling[leg, 0] = about_y * g.foot_radius
     m.rolling[leg, 1] = -about_x * g.foot_radius

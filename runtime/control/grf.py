@@ -147,6 +147,12 @@ def _slope(hessian, gradient, force, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def well_posed(hessian, gradient, friction, min_force, max_force):  # type: ignore[no-untyped-def]
+    """Whether the problem has a solution at all: finite, and with bounds that leave something between them."""
+    return np.isfinite(hessian.sum() + gradient.sum()) and min_force <= max_force
+
+
+@compiled
 def clipped_least_squares(hessian, gradient, friction, min_force, max_force):  # type: ignore[no-untyped-def]
     """The third resort: the unconstrained minimum (3n,), each leg clipped into its truncated pyramid."""
     force = np.linalg.solve(hessian, -gradient)

@@ -65,25 +65,44 @@ def leg_geometry(description: RobotDescription) -> Records:
 
 
 @compiled
+def sines_of_leg(q):  # type: ignore[no-untyped-def]
+    """Sine and cosine of abduction, hip, and hip + knee: all that foot, Jacobian and gravity need of ``q`` (3,)."""
+    return math.sin(q[0]), math.cos(q[0]), math.sin(q[1]), math.cos(q[1]), math.sin(q[1] + q[2]), math.cos(q[1] + q[2])
+
+
+@compiled
 def foot_of_leg(g, leg, q, foot):  # type: ignore[no-untyped-def]
     """Foot of one leg from its angles ``q`` (3,), written into ``foot`` (3,), m, body frame."""
+    foot_from_sines(g, leg, sines_of_leg(q), foot)
+
+
+@compiled
+def foot_from_sines(g, leg, sines, foot):  # type: ignore[no-untyped-def]
+    """``foot_of_leg`` with the sines at hand."""
+    s1, c1, s2, c2, s23, c23 = sines
     l1 = g.side[leg] * g.abduction_length
-    x = -g.thigh_length * math.sin(q[1]) - g.shank_length * math.sin(q[1] + q[2])
-    c = g.thigh_length * math.cos(q[1]) + g.shank_length * math.cos(q[1] + q[2])
+    x = -g.thigh_length * s2 - g.shank_length * s23
+    c = g.thigh_length * c2 + g.shank_length * c23
     foot[0] = g.hips[leg, 0] + x
-    foot[1] = g.hips[leg, 1] + l1 * math.cos(q[0]) + c * math.sin(q[0])
-    foot[2] = g.hips[leg, 2] + l1 * math.sin(q[0]) - c * math.cos(q[0])
+    foot[1] = g.hips[leg, 1] + l1 * c1 + c * s1
+    foot[2] = g.hips[leg, 2] + l1 * s1 - c * c1
 
 
 @compiled
 def jacobian_of_leg(g, leg, q, jacobian):  # type: ignore[no-untyped-def]
     """d foot / d q of one leg, written into ``jacobian`` (3, 3), body frame."""
+    jacobian_from_sines(g, leg, sines_of_leg(q), jacobian)
+
+
+@compiled
+def jacobian_from_sines(g, leg, sines, jacobian):  # type: ignore[no-untyped-def]
+    """``jacobian_of_leg`` with the sines at hand."""
+    s1, c1, s2, c2, s23, c23 = sines
     l1 = g.side[leg] * g.abduction_length
-    s1, c1 = math.sin(q[0]), math.cos(q[0])
-    shank_x = -g.shank_length * math.sin(q[1] + q[2])
-    shank_c = g.shank_length * math.cos(q[1] + q[2])
-    x = -g.thigh_length * math.sin(q[1]) + shank_x
-    c = g.thigh_length * math.cos(q[1]) + shank_c
+    shank_x = -g.shank_length * s23
+    shank_c = g.shank_length * c23
+    x = -g.thigh_length * s2 + shank_x
+    c = g.thigh_length * c2 + shank_c
     jacobian[0, 0] = 0.0
     jacobian[0, 1] = -c
     jacobian[0, 2] = -shank_c
@@ -134,9 +153,13 @@ def gravity_of_leg(g, leg, q, up, torque):  # type: ignore[no-untyped-def]
 
     ``up`` (3,) is the world's z axis in the body frame. The sum of m g (up · d com / d q) over the three links.
     """
-    s1, c1 = math.sin(q[0]), math.cos(q[0])
-    s2, c2 = math.sin(q[1]), math.cos(q[1])
-    s23, c23 = math.sin(q[1] + q[2]), math.cos(q[1] + q[2])
+    gravity_from_sines(g, leg, sines_of_leg(q), up, torque)
+
+
+@compiled
+def gravity_from_sines(g, leg, sines, up, torque):  # type: ignore[no-untyped-def]
+    """``gravity_of_leg`` with the sines at hand."""
+    s1, c1, s2, c2, s23, c23 = sines
     thigh, shank, abduction = g.thigh_moment[leg], g.shank_moment[leg], g.abduction_moment[leg]
     # m x com before the abduction rotation: x and z turn about y with hip and knee, y does not
     knee_x, knee_z = -g.shank_mass * g.thigh_length * s2, -g.shank_mass * g.thigh_length * c2

@@ -106,7 +106,7 @@ def set_parameters(record: Records, policy: Policy, parameters: Array) -> None:
     r = record[0]
     actions = len(policy.action_names)
     if policy.matrix:
-        r["matrix"][:actions] = parameters.reshape(actions, 28)
+        r["matrix"][:, :actions] = parameters.reshape(actions, 28).T
         return
     hidden = len(policy.hidden)
     r["hidden_size"] = hidden
@@ -131,11 +131,9 @@ def act(p, policy, s, t):  # type: ignore[no-untyped-def]
             for a in range(actions):
                 out[a] += policy.readout[a, h] * total
     else:
-        for a in range(actions):
-            total = 0.0
-            for i in range(28):
-                total += policy.matrix[a, i] * t.observation[i]
-            out[a] = total
+        for i in range(28):
+            for a in range(24):
+                out[a] += policy.matrix[i, a] * t.observation[i]
     for a in range(actions):
         out[a] *= policy.action_scale[a]
     for leg in range(4):

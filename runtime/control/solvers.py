@@ -19,6 +19,7 @@ from runtime.control.grf import (
     clipped_least_squares,
     force_bounds,
     pyramid,
+    well_posed,
 )
 from runtime.control.records import SolverStatus
 
@@ -42,12 +43,12 @@ class DaqpSolver:
     def solve(self, problem: GrfProblem) -> Array | None:
         """See ``GrfSolver``. ``sense`` is cleared each time, so the result is a pure function of the problem."""
         n = len(problem.gradient)
-        bounds = (problem.friction, problem.min_force, problem.max_force)
+        bounds = problem[2:]
         known = self._models.pop(n, None)  # put back on success alone: whatever went wrong may have left it broken
         if known is None or known[0] != bounds:
             known = (bounds, self._setup(problem), np.zeros(n + PYRAMID_ROWS * n // 3, np.int32))
         _, model, sense = known
-        if model.update(H=problem.hessian, f=problem.gradient, sense=sense) < 0:
+        if model.update(problem.hessian, problem.gradient, None, None, None, sense) < 0:
             return None
         force, _, exitflag, _ = model.solve()
         if exitflag != 1:
@@ -161,10 +162,22 @@ class Ladder:
 
     def solve(self, problem: GrfProblem) -> tuple[Array | None, SolverStatus]:
         """Forces (3n,) that were accepted and how they were found; None when nothing finite came out."""
-        for solver, status in ((self.first, SolverStatus.SOLVED), (self.second, SolverStatus.SECOND)):
-            force = _guarded(solver, problem)
-            if force is not None and accept(*problem, force):
-                return force, status
+        force = self.ask_first(problem)
+        if force is not None and accept(*problem, force):
+            return force, SolverStatus.SOLVED
+        return self.fall_back(problem)
+
+    def ask_first(self, problem: GrfProblem) -> Array | None:
+        """What the first solver says; the caller is to hold it against ``grf.accept``."""
+        return _guarded(self.first, problem)
+
+    def fall_back(self, problem: GrfProblem) -> tuple[Array | None, SolverStatus]:
+        """The steps below the first solver."""
+        if not well_posed(*problem):  # nothing to ask the others, who may take long to find out
+            return None, SolverStatus.FAILED
+        force = _guarded(self.second, problem)
+        if force is not None and accept(*problem, force):
+            return force, SolverStatus.SECOND
         try:
             force = clipped_least_squares(*problem)
         except np.linalg.LinAlgError:

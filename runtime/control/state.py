@@ -18,13 +18,14 @@ WORK_DTYPE = np.dtype(
     [
         ("imu", "f8", (10,)),  # quaternion, angular velocity, linear acceleration
         ("joints", "f8", (3, 4, 3)),  # position, velocity, torque
-        ("asked", "f8", (3,)),  # vx, vy, yaw rate of the operator
         # left by the estimator
         ("to_world", "f8", (3, 3)),  # body to world
         ("rotation", "f8", (3, 3)),  # body to heading frame
         ("jacobian", "f8", (4, 3, 3)),
         ("foot", "f8", (3,)),
+        ("gravity", "f8", (3,)),
         ("force", "f8", (3,)),
+        ("angles", "f8", (3,)),
         ("foot_in_world", "f8", (4, 3)),
         ("odometry", "f8", (4, 3)),  # velocity of the body that each foot tells, world, m/s
         ("rolling", "f8", (4, 3)),  # velocity of each rolling foot's centre, world, m/s
@@ -149,7 +150,7 @@ POLICY_DTYPE = np.dtype(
         ("centripetal", "f8"),
         ("slope_feet", "f8"),
         ("slope_body", "f8"),
-        ("matrix", "f8", (24, 28)),
+        ("matrix", "f8", (28, 24)),  # transposed: the processor takes several actions at a time
         ("hidden", "f8", (HIDDEN, 28)),
         ("readout", "f8", (24, HIDDEN)),
     ],

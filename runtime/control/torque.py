@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from runtime.control.compilation import compiled
 from runtime.control.estimator import transposed_times
 from runtime.control.kinematics import angles_of_leg
@@ -15,13 +13,13 @@ GAIN_RISE = 0.5
 
 
 @compiled
-def command_joints(p, g, s, t, rotation, jacobian, standing, out):  # type: ignore[no-untyped-def]
+def command_joints(p, g, s, t, m, standing, out):  # type: ignore[no-untyped-def]
     """Joint targets, gains and feed-forward torque of all legs, into ``t`` and ``out`` (5, 4, 3).
 
     Swing: full gains, no feed-forward. Stance: -Jᵀ f with the scaled gains. The wanted joint speed is the bounded
     difference of the targets, zero on the tick where a leg changes between swing and stance.
     """
-    foot, force, target = np.empty(3), np.empty(3), np.empty(3)
+    rotation, jacobian, foot, force, target = m.rotation, m.jacobian, m.foot, m.force, m.angles
     for leg in range(4):
         changed = s.stance[leg] != t.stance[leg] or not s.commanded
         transposed_times(rotation, t.foot_targets[leg], foot)
