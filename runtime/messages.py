@@ -104,6 +104,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     armed: bool
     fault: str
     """The fault that stands until it is cleared; empty for none."""
+    health: str = ""
+    """What the guard says of the last measurement; empty when all is in order."""
     reason: str
     """Why the mode is what it is, in words."""
     policy: str

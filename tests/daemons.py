@@ -81,11 +81,13 @@ def is_damp(command: JointCommand) -> bool:
 class Served:
     """A daemon in this process and a client beside it; the client's calls run on a thread, as another process would."""
 
-    def __init__(self, made: Config, folder: Path, body: Probe | None = None) -> None:
+    def __init__(self, made: Config, folder: Path, body: Any = None, channels: Any = lambda _keys: ()) -> None:
         self.config = made
         self.body = body or Probe(made)
         self.ready = asyncio.Event()
-        job = Job(made, "# test", make_policy(made.robot.name), self.body, folder, ready=lambda: self.ready.set())
+        job = Job(
+            made, "# test", make_policy(made.robot.name), self.body, folder, channels, ready=lambda: self.ready.set()
+        )
         self.daemon = Daemon(job)
 
     async def __aenter__(self) -> Served:
