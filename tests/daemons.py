@@ -118,7 +118,7 @@ class Served:
 
     async def reach(self, mode: Mode) -> None:
         async with asyncio.timeout(20):
-            while self.daemon.cycle.state.mode is not mode:
+            while self.daemon.cycle.state.mode is not mode:  # noqa: ASYNC110
                 await asyncio.sleep(0.005)
 
     async def stand(self) -> None:

@@ -90,7 +90,7 @@ def test_a_client_arms_stands_walks_and_sits(tmp_path: Path) -> None:
         await served.client(drive)
         assert (await served.ask("stand")).accepted
         async with asyncio.timeout(10):
-            while not (await served.ask("sit")).accepted:
+            while not (await served.ask("sit")).accepted:  # noqa: ASYNC110
                 await asyncio.sleep(0.05)
         await served.reach(Mode.DAMP)
 
@@ -213,7 +213,7 @@ def test_a_fault_is_recorded_with_all_that_a_replay_needs(tmp_path: Path) -> Non
         served.body.change = break_motor
         await served.reach(Mode.DAMP)
         async with asyncio.timeout(10):
-            while not served.daemon.recordings:
+            while not served.daemon.recordings:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
 
     served = serve(tmp_path, act)
@@ -306,7 +306,7 @@ def test_an_operator_that_goes_away_stops_the_walk(tmp_path: Path) -> None:
 
         await served.client(come_and_go)
         async with asyncio.timeout(1.5):  # well before the command itself would be given up
-            while served.daemon.cycle.state.mode is not Mode.STAND:
+            while served.daemon.cycle.state.mode is not Mode.STAND:  # noqa: ASYNC110
                 await asyncio.sleep(0.005)
 
     serve(tmp_path, act)
