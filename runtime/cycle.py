@@ -17,8 +17,9 @@ from runtime import modes
 from runtime.config import Config
 from runtime.control.controller import Controller
 from runtime.control.policy import Policy
-from runtime.control.posture import Posture, blend, minimum_jerk
-from runtime.control.records import CONTROL_DTYPE, Clamp, SolverStatus, VelocityCommand
+from runtime.control.posture import POSTURE_DTYPE, Posture, blend, minimum_jerk
+from runtime.control.records import CONTROL_DTYPE, Clamp, Records, SolverStatus, VelocityCommand
+from runtime.control.state import STATE_DTYPE
 from runtime.limits import Guard
 from runtime.messages import CONTROL_OFFSET, TICK_DTYPE, Event, Mode, Request
 from runtime.modes import Answer, ModeState, Reason
@@ -33,6 +34,28 @@ _EXPIRED = int(Clamp.EXPIRED)
 _COMMAND_FIELDS = ("position", "velocity", "kp", "kd", "torque")
 _PLAN_FIELDS = ("velocity_command", "observation", "asked", "action", "phase", "stance", "touchdown", "foot_targets")
 _BLANK_FIELDS = (*_PLAN_FIELDS, "target_wrench", "grf", "solver_status", "clamps")
+
+
+KEYFRAME_DTYPE = np.dtype(
+    [
+        ("index", "u8"),  # of the tick at whose end it was taken
+        ("control", STATE_DTYPE),
+        ("posture", POSTURE_DTYPE),
+        ("mean_square", "f8", (4, 3)),
+        ("command", "f8", (5, 4, 3)),
+        ("blend_from", "f8", (5, 4, 3)),
+        ("blend_left", "f8"),
+        ("velocity", "f8", (3,)),
+        ("velocity_stamp", "f8"),
+        ("mode", "u1"),
+        ("armed", "u1"),
+        ("reason", "u2"),
+        ("fault", "u2"),
+        ("verdict", "u2"),
+    ],
+    align=True,
+)
+"""What a cycle remembers from tick to tick: with it a replay can begin in the middle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +114,11 @@ class Cycle:
     def policy(self) -> Policy:
         """The active policy."""
         return self.controller.policy
+
+    @property
+    def health(self) -> str:
+        """What the guard says of the last measurement; empty when all is in order."""
+        return "" if self._verdict is _OK else self.guard.explain(self._verdict, self.tick)
 
     def swap_policy(self, policy: Policy) -> None:
         """Take another policy, between two ticks."""
@@ -158,6 +186,43 @@ class Cycle:
         before = self.state
         self.state = ModeState(Mode.DAMP, False, reason, before.fault)
         self._enter(before)
+
+    def remember(self) -> Records:
+        """All that the next tick depends on beside this tick's record. Shape (1,) of ``KEYFRAME_DTYPE``."""
+        keyframe = np.zeros(1, KEYFRAME_DTYPE)
+        k, state = keyframe[0], self.state
+        k["index"], k["control"], k["mean_square"] = (
+            self._row["index"],
+            self.controller.state[0],
+            self.guard.mean_square,
+        )
+        for key, command in (("command", self._command), ("blend_from", self._blend_from)):
+            for row, name in enumerate(_COMMAND_FIELDS):
+                k[key][row] = getattr(command, name)
+        k["blend_left"], k["velocity_stamp"] = self._blend_left, self._velocity.stamp
+        k["velocity"][:2], k["velocity"][2] = self._velocity.linear, self._velocity.yaw_rate
+        k["mode"], k["armed"], k["reason"] = int(state.mode), state.armed, int(state.reason)
+        k["fault"], k["verdict"] = int(state.fault), int(self._verdict)
+        self.posture.remember(k["posture"])
+        return keyframe
+
+    def recall(self, keyframe: Records, tick: Records) -> None:
+        """Be as after the tick ``tick`` (1,), at whose end ``keyframe`` (1,) was remembered."""
+        k = keyframe[0]
+        self.tick[:] = tick
+        self.controller.state[:] = keyframe["control"]
+        self.guard.mean_square[:] = k["mean_square"]
+        self._command = JointCommand(*k["command"].copy())
+        self._blend_from = JointCommand(*k["blend_from"].copy())
+        self._blend_left = float(k["blend_left"])
+        velocity = k["velocity"].copy()
+        self._velocity = VelocityCommand(float(k["velocity_stamp"]), velocity[:2], float(velocity[2]))
+        self.state = ModeState(
+            Mode(int(k["mode"])), bool(k["armed"]), Reason(int(k["reason"])), Reason(int(k["fault"]))
+        )
+        self._verdict = Reason(int(k["verdict"]))
+        self.generation = int(self._row["policy"])
+        self.posture.recall(k["posture"])
 
     def note(self, kind: str, text: str) -> None:
         """Add an event."""

@@ -39,6 +39,8 @@ log = logging.getLogger("trotd")
 
 DAMP_REPLIES = 3
 """Exchanges that must come back before a stopping daemon believes that the body damps."""
+POLICIES_BEFORE = 8
+"""Files of policies no longer active that a recording still takes along."""
 VERSIONED = ("trotd", "numpy", "numba", "daqp", "msgspec", "eclipse-zenoh")
 
 
@@ -79,6 +81,7 @@ class Daemon:
         self.recordings: list[Path] = []
         """Written by this daemon."""
         self._policy_bytes = encode_policy(job.policy)
+        self._policies_before: dict[int, bytes] = {}
         self._policy_file = job.folder / "policies" / f"{job.config.robot.name}.json"
         self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
         self._stop: asyncio.Event | None = None
@@ -203,6 +206,8 @@ class Daemon:
                 self._compute[recorder.count % len(self._compute)] = compute
                 recorder.keep(cycle.tick)
                 link.offer(cycle.tick)
+                if recorder.count % recorder.keyframe_every == 1 % recorder.keyframe_every:
+                    recorder.keep_keyframe(cycle.remember())
                 if recorder.count == 1:
                     self.job.ready()
                     notifier.tell("READY=1")
@@ -296,6 +301,8 @@ class Daemon:
             layout=layout(),
             itemsize=self.cycle.tick.dtype.itemsize,
             events=list(self.recorder.events),
+            keyframes=self.recorder.keyframes(),
+            policies={generation: data.decode() for generation, data in self._policies_before.items()},
         )
         path = self.recorder.write(header, f"{stamp}-{reason.replace(' ', '-')}")
         self.recordings.append(path)
@@ -334,6 +341,9 @@ class Daemon:
 
     def take_policy(self, policy: Policy, data: bytes) -> None:
         """Make a verified policy the active one."""
+        self._policies_before[self.cycle.generation] = self._policy_bytes
+        if len(self._policies_before) > POLICIES_BEFORE:
+            del self._policies_before[min(self._policies_before)]
         self.cycle.swap_policy(policy)
         self._policy_bytes = data
 
@@ -364,6 +374,7 @@ class Daemon:
             mode=current.mode.name,
             armed=current.armed,
             fault="" if current.fault is Reason.OK else current.fault.words,
+            health=cycle.health,
             reason=current.reason.words,
             policy=f"{cycle.policy.name} {hashlib.sha256(self._policy_bytes).hexdigest()[:12]}",
             rate_hz=self.config.control.rate_hz,

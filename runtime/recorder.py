@@ -27,6 +27,7 @@ CHUNK = 256
 """Records written at a time."""
 MARGIN_SECONDS = 2.0
 """Extra ring beyond what is kept, so that a writer is never overtaken by the ticks."""
+KEYFRAME_SECONDS = 1.0
 EVENTS = 1000
 _length = struct.Struct("<Q")
 
@@ -52,6 +53,10 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     """Name, numpy type, shape and offset of every field of a record."""
     itemsize: int
     events: list[Event]
+    keyframes: list[bytes] = []
+    """Records of ``runtime.cycle.KEYFRAME_DTYPE``, raw: what a replay begins from."""
+    policies: dict[int, str] = {}
+    """Files of all policies that these ticks may have used, by generation; without the active one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +78,10 @@ class Recorder:
         """What happened lately."""
         self.count = 0
         """Ticks kept since the start."""
+        self.keyframe_every = max(1, round(rate_hz * KEYFRAME_SECONDS))
+        """Ticks between two keyframes; the first tick has one."""
         self._wanted = max(1, round(rate_hz * seconds))
+        self._keyframes: deque[tuple[int, Records]] = deque(maxlen=2 + self._wanted // self.keyframe_every)
         self._ring = np.zeros(self._wanted + round(rate_hz * MARGIN_SECONDS) + CHUNK, TICK_DTYPE)
         self._ring.view(np.uint8)[:] = 0  # touch every page now, not in the loop
         self._max_files, self._max_bytes = max_files, max_bytes
@@ -82,6 +90,15 @@ class Recorder:
         """Copy the record of one tick (1,) into the ring."""
         self._ring[self.count % len(self._ring)] = tick[0]
         self.count += 1
+
+    def keep_keyframe(self, keyframe: Records) -> None:
+        """Take what was remembered after the tick that was kept last."""
+        self._keyframes.append((self.count - 1, keyframe))
+
+    def keyframes(self) -> list[bytes]:
+        """The oldest few that belong to ticks which a file written now would hold."""
+        first = self.count - self._wanted
+        return [keyframe.tobytes() for count, keyframe in tuple(self._keyframes) if count >= first][:3]
 
     def write(self, header: Header, stem: str) -> Path:
         """Write what the ring holds to ``<folder>/<stem>.trotd``: whole or not at all. Blocks; not for the loop.

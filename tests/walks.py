@@ -36,6 +36,8 @@ class Walk:
         self.cycle.warm_up(self.measurement)
         self.command = damp_command(self.config.damp.kd)
         self.index = 0
+        self.policies: dict[int, str] = {}
+        """Those before the active one, by generation."""
 
     def run(self, seconds: float, velocity: tuple[float, float, float] | None = None) -> None:
         """Live on, under one velocity command if any."""
@@ -53,6 +55,8 @@ class Walk:
 
     def _keep(self) -> None:
         self.recorder.keep(self.cycle.tick)
+        if self.recorder.count % self.recorder.keyframe_every == 1:
+            self.recorder.keep_keyframe(self.cycle.remember())
         while self.cycle.events:
             self.recorder.events.append(self.cycle.events.popleft())
 
@@ -86,6 +90,8 @@ class Walk:
             layout=layout(),
             itemsize=self.cycle.tick.dtype.itemsize,
             events=list(self.recorder.events),
+            keyframes=self.recorder.keyframes(),
+            policies=self.policies,
         )
 
     def write(self, stem: str = "walk") -> Path:

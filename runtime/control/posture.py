@@ -17,6 +17,7 @@ from drivers.description import RobotDescription
 from drivers.robot import Array, JointCommand, Measurement
 from runtime.control.kinematics import GRAVITY, forward, inverse, jacobians, leg_geometry
 from runtime.control.parameters import ControlConfig
+from runtime.control.records import Records
 from runtime.control.state import build_parameters
 
 
@@ -51,6 +52,29 @@ class Segment:
     """Share of the gains, at start and end."""
     load: tuple[float, float]
     """Share of the weight that is fed forward, at start and end."""
+
+
+SEGMENTS = 5
+"""Segments of the longest movement."""
+POSTURE_DTYPE = np.dtype(
+    [
+        ("gain", "f8"),
+        ("load", "f8"),
+        ("elapsed", "f8"),
+        ("finished", "u1"),
+        ("aimed", "u1"),  # 1 where target holds a target
+        ("target", "f8", (4, 3)),
+        ("count", "u1"),
+        ("duration", "f8", (SEGMENTS,)),
+        ("start", "f8", (SEGMENTS, 4, 3)),
+        ("end", "f8", (SEGMENTS, 4, 3)),
+        ("feet", "u1", (SEGMENTS,)),
+        ("gains", "f8", (SEGMENTS, 2)),
+        ("loads", "f8", (SEGMENTS, 2)),
+    ],
+    align=True,
+)
+"""A movement in progress, whole."""
 
 
 def minimum_jerk(share: float) -> float:
@@ -155,6 +179,35 @@ class Posture:
         velocity = np.zeros((4, 3)) if self._target is None else (q - self._target) / self.dt
         self._target = q
         return JointCommand(q.copy(), velocity, self.gain * self.kp, self.gain * self.kd, self._bear(q))
+
+    def remember(self, memory: Records) -> None:
+        """Write the movement in progress into ``memory`` () of ``POSTURE_DTYPE``."""
+        memory["gain"], memory["load"], memory["elapsed"] = self.gain, self.load, self._elapsed
+        memory["finished"], memory["aimed"] = self.finished, self._target is not None
+        if self._target is not None:
+            memory["target"] = self._target
+        memory["count"] = len(self._segments)
+        for index, segment in enumerate(self._segments):
+            memory["duration"][index], memory["feet"][index] = segment.duration, segment.feet
+            memory["start"][index], memory["end"][index] = segment.start, segment.end
+            memory["gains"][index], memory["loads"][index] = segment.gain, segment.load
+
+    def recall(self, memory: Records) -> None:
+        """Go on with the movement that was written into ``memory``."""
+        self.gain, self.load = float(memory["gain"]), float(memory["load"])
+        self._elapsed, self.finished = float(memory["elapsed"]), bool(memory["finished"])
+        self._target = memory["target"].copy() if memory["aimed"] else None
+        self._segments = [
+            Segment(
+                float(memory["duration"][index]),
+                memory["start"][index].copy(),
+                memory["end"][index].copy(),
+                bool(memory["feet"][index]),
+                tuple(memory["gains"][index].tolist()),
+                tuple(memory["loads"][index].tolist()),
+            )
+            for index in range(int(memory["count"]))
+        ]
 
     def _bear(self, q: Array) -> Array:
         """-Jᵀ f with a quarter of the borne weight on every foot, N·m."""
