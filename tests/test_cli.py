@@ -94,7 +94,7 @@ def test_a_daemon_serves_the_verbs_and_ends_cleanly(tmp_path: Path) -> None:
     ) as daemon:
         try:
             talk = ["--robot", robot, "--connect", endpoint]
-            end = time.monotonic() + 100
+            end = time.monotonic() + 250
             while (answer := trotd("stand", *talk)).returncode and "refused" not in answer.stdout:
                 assert daemon.poll() is None and time.monotonic() < end, answer.stderr
                 time.sleep(0.2)
