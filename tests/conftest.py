@@ -8,7 +8,10 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
 
+settings.register_profile("untimed", deadline=None)  # the machine may be busy: no test is held to a time
+settings.load_profile("untimed")
 GRACE = 3.0
 """s that a thread may take to end after its owner let go of it."""
 
