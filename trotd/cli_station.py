@@ -23,11 +23,12 @@ def refusals() -> Iterator[None]:
     from runtime.config import ConfigError
     from runtime.policies import PolicyError
     from runtime.recorder import RecordingError
+    from runtime.replay import ReplayError
     from station.session import StationError
 
     try:
         yield
-    except (ConfigError, PolicyError, RecordingError, StationError) as error:
+    except (ConfigError, PolicyError, RecordingError, ReplayError, StationError, OSError) as error:
         typer.echo(f"trotd: {error}", err=True)
         sys.exit(1)
     except KeyboardInterrupt:
@@ -161,6 +162,95 @@ def health(
         for check in checks:
             typer.echo(f"{check.level.name.lower():8} {check.name:12} {check.words}")
     raise typer.Exit(int(max(check.level for check in checks) if checks else Level.OK))
+
+
+@app.command()
+def recordings(
+    name: Annotated[str | None, typer.Argument(help="Fetch this one; without it, list them.")] = None,
+    robot: RobotOption = "stoch3",
+    connect: ConnectOption = ENDPOINT,
+    write: Annotated[bool, typer.Option("--write", help="Write what the recorder holds now, first.")] = False,
+    to: Annotated[Path, typer.Option("--to", help="Folder to fetch into.", file_okay=False)] = Path(),
+) -> None:
+    """List the robot's recordings, or fetch one over the link."""
+    from runtime import config
+    from runtime.messages import RecordingEntry, RecordingReply
+    from station.session import StationError, connected
+
+    with refusals():
+        known = config.load(config.find_robot(robot))
+        with connected(known.robot.name, connect) as station:
+            key = station.keys.recording
+            if write:
+                reply = station.ask_for(RecordingReply, key, parameters="write")
+                if not reply.accepted:
+                    raise StationError(f"robot {known.robot.name!r}: {reply.reason}")
+                typer.echo(f"written on the robot: {reply.path}")
+            if name is not None:
+                path = to / Path(name).name
+                path.write_bytes(station.ask(key, parameters=f"name={name}", timeout=60.0))
+                typer.echo(f"fetched: {path} ({path.stat().st_size} bytes)")
+            elif not write:
+                for entry in station.ask_for(list[RecordingEntry], key):
+                    typer.echo(f"{entry.name}  {entry.size / 1e6:.1f} MB")
+
+
+@app.command()
+def replay(
+    recording: Annotated[Path, typer.Argument(help="A .trotd file.", exists=True, dir_okay=False)],
+    policy: Annotated[Path | None, typer.Option(help="Ask what this policy would have done.", exists=True)] = None,
+) -> None:
+    """Run a recording through the core again: bit for bit the same, or the first tick and stage that differ."""
+    import time
+
+    from runtime import policies, recorder
+    from runtime.replay import Player, compare_policy
+    from runtime.replay import replay as play
+
+    with refusals():
+        loaded = recorder.load(recording)
+        if policy is not None:
+            other = compare_policy(loaded, policies.load(policy, loaded.header.robot))
+            typer.echo(f"{other.ticks} walking ticks under {policy.name}, differences as root mean squares:")
+            typer.echo(f"  shifts {other.shift * 1e3:.1f} mm, force {other.force:.1f} N, moment {other.moment:.1f} N·m")
+            typer.echo(f"  feed-forward torque {other.torque:.2f} N·m")
+            typer.echo(f"  ticks with a clamp {other.clamped_before:.1%} then, {other.clamped_now:.1%} now")
+            return
+        next(Player(loaded).play(), None)  # compiled code is loaded before the clock runs
+        began = time.perf_counter()
+        result = play(loaded)
+        speed = result.ticks / loaded.header.rate_hz / (time.perf_counter() - began)
+        modes = ", ".join(f"{name} {count}" for name, count in result.modes.items())
+        typer.echo(
+            f"{result.ticks} ticks ({modes}), {result.skipped} before the first keyframe, {speed:.0f} x real time"
+        )
+        if result.difference is not None:
+            typer.echo(f"differs: {result.difference}")
+            typer.echo(f"recorded with {', '.join(f'{k} {v}' for k, v in result.versions.items())}")
+            raise typer.Exit(1)
+        typer.echo("bit for bit the same")
+
+
+@app.command()
+def export(
+    recording: Annotated[Path, typer.Argument(help="A .trotd file.", exists=True, dir_okay=False)],
+    csv: Annotated[Path | None, typer.Option("--csv", help="Every number of every tick.")] = None,
+    mcap: Annotated[Path | None, typer.Option("--mcap", help="ROS 2 messages, for Foxglove.")] = None,
+    rrd: Annotated[Path | None, typer.Option("--rrd", help="For rerun.")] = None,
+) -> None:
+    """Write a recording as CSV, MCAP or RRD."""
+    from runtime import recorder
+    from station.export import EXPORTS
+    from station.session import StationError
+
+    with refusals():
+        wanted = {kind: path for kind, path in (("csv", csv), ("mcap", mcap), ("rrd", rrd)) if path is not None}
+        if not wanted:
+            raise StationError("name at least one of --csv, --mcap, --rrd")
+        loaded = recorder.load(recording)
+        for kind, path in wanted.items():
+            EXPORTS[kind](loaded, path)
+            typer.echo(f"{path}: {path.stat().st_size} bytes")
 
 
 def register(front: typer.Typer) -> None:
