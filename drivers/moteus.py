@@ -4,7 +4,9 @@ Facts: mjbots moteus ``docs/protocol/can.md`` (frames) and ``fw/bldc_servo_contr
 revolutions and multiples of its own gains; both stop at this module, whose callers see radians, N·m and N·m/rad at the
 motor's output.
 
-Three traps that every command disarms: it carries its own watchdog (never NaN, which would mean none); it sends
+Four traps that every command disarms: a servo moves its position target along with the commanded velocity, so the
+velocity's share of the law goes out as feed-forward torque and the velocity as 0, which is the law of
+``drivers.robot.motor_torque`` to the letter; it carries its own watchdog (never NaN, which would mean none); it sends
 negative velocity and acceleration limits, because newer firmware otherwise plans a slow trajectory of its own; it is
 padded with NOP, because zero padding reads as a write.
 """
@@ -58,8 +60,9 @@ _NOT_SET = {
     "compact": np.array([np.inf, -32768.0, -32768.0, -32768.0, -128.0, -128.0, np.inf]),
 }
 _NO_LIMIT = -1
+_VELOCITY, _TORQUE, _KD = 1, 2, 4
 _MAX16, _MAX8 = 32767, 127
-_ABSURD = 1e9
+_ABSURD = 1e6
 
 
 class MoteusCodec:
@@ -124,11 +127,13 @@ class MoteusCodec:
         Raises:
             ValueError: a value is not finite (a servo would read NaN as "hold" or "full gain"), or absurd.
         """
-        wire = commands * self._to_wire
-        sane = np.abs(wire) < _ABSURD
+        sane = np.abs(commands) < _ABSURD
         if not sane.all():
             row, column = np.argwhere(~sane)[0]
             raise ValueError(f"command to motor {self.ids[row]}: value {column} is {commands[row, column]}")
+        wire = commands * self._to_wire
+        wire[:, _TORQUE] += commands[:, _VELOCITY] * commands[:, _KD] * self._to_wire[_TORQUE]
+        wire[:, _VELOCITY] = 0.0
         frames = self._frames
         if self.form == "float":
             frames["values"] = wire

@@ -42,8 +42,8 @@ def test_float_command_is_byte_for_byte_the_packages(command):
     position, velocity, torque, kp, kd = command[0]
     theirs = moteus.Controller(id=11, position_resolution=INT8_LIMITS).make_position(
         position=wire(position / REVOLUTION),
-        velocity=wire(velocity / REVOLUTION),
-        feedforward_torque=torque,
+        velocity=0.0,
+        feedforward_torque=torque + kd * velocity,
         kp_scale=wire(kp * (REVOLUTION / SERVO_KP)),
         kd_scale=wire(kd * (REVOLUTION / SERVO_KD)),
         maximum_torque=18.0,
@@ -71,8 +71,8 @@ def test_compact_command_means_the_same_within_half_a_step(command):
     assert len(ours) == 32
     steps = {
         Register.COMMAND_POSITION: (command[0, 0] / REVOLUTION, 1e-4, 3.2767),
-        Register.COMMAND_VELOCITY: (command[0, 1] / REVOLUTION, 2.5e-4, 8.19175),
-        Register.COMMAND_TORQUE: (command[0, 2], 0.01, 327.67),
+        Register.COMMAND_VELOCITY: (0.0, 2.5e-4, 8.19175),
+        Register.COMMAND_TORQUE: (command[0, 2] + command[0, 4] * command[0, 1], 0.01, 327.67),
         Register.COMMAND_KP_SCALE: (command[0, 3] * REVOLUTION / SERVO_KP, 1 / 127, 1.0),
         Register.COMMAND_KD_SCALE: (command[0, 4] * REVOLUTION / SERVO_KD, 1 / 127, 1.0),
     }

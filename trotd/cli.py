@@ -115,6 +115,10 @@ def run(
         config, path = _load(robot, rate_hz, listen)
         chosen = policies.load(policies.find_policy(policy or config.control.policy, path.parent), config.robot.name)
         place = folder or state_folder()
+        if body == "twin":
+            from trotd.wire import lenient
+
+            config = lenient(config)
         part = build_body(body, config, path, place, observe)
         job = daemon.Job(config, path.read_text(), chosen, part.robot, place, part.channels, _say_ready)
         for written in daemon.main(job).recordings:

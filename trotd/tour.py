@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import socket
 import subprocess
@@ -23,12 +22,11 @@ from runtime.config import Config
 from runtime.messages import Status
 from station.session import Station, StationError, connected
 from station.tour import Tour, TourReport
+from trotd.wire import MEETING, favour, twin_folder
 
 START_TIMEOUT = 180.0
 """s; the first start of all compiles the core."""
 STOP_TIMEOUT = 15.0
-WIRE_PRIORITY = -10
-"""Niceness of a daemon on wires, where it may: the twin's servos do not wait for it."""
 BAD_INPUT = 2
 """The exit code by which a daemon says so."""
 TABLE_WIDTH = 132
@@ -67,8 +65,7 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
             stderr=subprocess.STDOUT,
         )
         if wire:
-            with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, child.pid, WIRE_PRIORITY)
+            favour(child.pid)
         try:
             with (
                 _reach(config.robot.name, endpoint, child, output) as station,
@@ -90,8 +87,6 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
 @contextlib.contextmanager
 def _twin(robot: str, endpoint: str, arguments: Sequence[str]) -> Iterator[list[str]]:
     """A running twin; the daemon's arguments, with the state folder that they share."""
-    from trotd.wire import MEETING, twin_folder
-
     arguments = list(arguments)
     with contextlib.ExitStack() as stack:
         if "--state" not in arguments:

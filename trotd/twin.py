@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import os
 import signal
 import socket
 import time
@@ -31,12 +30,11 @@ from sim.twin import RATE_HZ, REAL_NOISE, TwinSetup, WireTwin, run_twin
 from sim.world import World
 from sim.xbus_emulator import Product
 from trotd.bodies import push_world, truth_message
-from trotd.wire import IMU_LINK, KNOWN, MEETING, own_wires, twin_folder, twin_wires
+from trotd.wire import IMU_LINK, KNOWN, MEETING, favour, own_wires, twin_folder, twin_wires
 
 TRUTH_EVERY = round(RATE_HZ / 100)
 """Steps between two messages of the truth."""
-PRIORITY = -10
-"""Its niceness, where it may: servos and an IMU do not wait for a compiler."""
+PHYSICS_RATE_HZ = 2 * RATE_HZ
 LAB = "stoch3"
 """The robot whose build is known from its lab's own files."""
 
@@ -68,14 +66,13 @@ def serve_twin(config: Config, folder: Path, endpoint: str, options: TwinOptions
         calibration.save(true_calibration(build, config, wires.motors), known)
     else:
         build = scrambled(build, options.scramble)
-    world = World(config.robot, RATE_HZ, config.control.gait.walking_height)
+    world = World(config.robot, RATE_HZ, config.control.gait.walking_height, PHYSICS_RATE_HZ)
     pose = Posture(config.robot, config.control, config.posture).folded_joints
     scenario = Scenario(joint_position=pose, noise=REAL_NOISE if options.noise else Noise())
     twin = WireTwin(world, TwinSetup(build, wires.motors, scenario, options.product), meeting / IMU_LINK)
     bus = twin_wires(wires, meeting, port, 0.01).bus
     place = meeting / MEETING
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
+    favour(0)
     try:
         with _told(config.robot.name, endpoint, world) as tell:
             live = _live(lambda: run_twin(twin, bus, tell), lambda: place.write_text(json.dumps({"port": port})))
@@ -120,7 +117,7 @@ def _told(robot: str, endpoint: str, world: World) -> Iterator[Callable[[], None
     keys = Keys(robot)
     settings = session_config("peer", [], [endpoint])
     settings.insert_json5("connect/exit_on_failure", "false")
-    settings.insert_json5("connect/timeout_ms", "0")
+    settings.insert_json5("connect/timeout_ms", "-1")
     steps = 0
     with zenoh.open(settings) as session:
         truth = session.declare_publisher(keys.sim_truth)
