@@ -1,4 +1,4 @@
-# make run: the robot walks a tour in the simulator.   make test: the suite.   make check: lint, types, contracts.
+# make run: the robot walks a tour in the simulator.   make run-wire: the same over the real drivers.   make test: the suite.   make check: lint, types, contracts.
 # make bench: what the numbers in docs/performance.md come from.
 # Each creates the environment it needs in .venv; PYTHON names the interpreter to make it with.
 
@@ -8,10 +8,13 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run test check bench format clean
+.PHONY: run run-wire test check bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
+
+run-wire: $(VENV)/.sim
+	@$(BIN)/trotd tour --wire
 
 test: $(VENV)/.dev
 	$(BIN)/pytest $(PYTEST_ARGS)
