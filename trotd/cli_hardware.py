@@ -19,6 +19,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this file to the front door."""
     app.command()(twin)
     app.command()(check)
+    app.command()(commission)
 
 
 @contextlib.contextmanager
@@ -81,3 +82,44 @@ def check(robot: RobotOption = "stoch3", body: BodyOption = "hardware", folder: 
         console = Console()
         if not pre_flight.show(rows, Console(width=max(console.width, 120))):
             raise typer.Exit(FAILED)
+
+
+def commission(
+    robot: RobotOption = "stoch3",
+    body: BodyOption = "hardware",
+    undo: Annotated[str | None, typer.Option(help="Do a step again: joints, stops or mount.")] = None,
+    folder: StateOption = None,
+) -> None:
+    """Find out how a robot is put together: ids, signs, zeros, the IMU's mount. Energises nothing; can be interrupted.
+
+    People turn the joints, the encoders tell what moved. Writes the calibration that a daemon needs.
+    """
+    with _one_line_errors():
+        from drivers import calibration
+        from runtime import config
+        from runtime.state import state_folder
+        from trotd.commission import STEPS, Commission
+        from trotd.commission_wires import CommissionWires
+        from trotd.wire import calibration_file, wires_of
+
+        place = folder or state_folder()
+        loaded = config.load(config.find_robot(robot))
+        wires = wires_of(body, loaded, place)
+        path = calibration_file(body, loaded, place)
+        with CommissionWires(wires) as readings:
+            work = Commission(
+                loaded,
+                wires.motors,
+                path.with_suffix(".progress.json"),
+                readings.motors,
+                readings.force,
+                lambda text: typer.prompt(f"{text}; then Enter", default="", show_default=False) and None,
+            )
+            if undo is not None:
+                steps = [step for step in STEPS if step == undo]
+                if not steps:
+                    raise ValueError(f"--undo {undo}: {', '.join(STEPS)}")
+                work.undo(steps[0])
+            calibration.save(work.run(), path)
+        work.path.unlink(missing_ok=True)
+        typer.echo(f"calibration: {path}")
