@@ -168,7 +168,7 @@ def test_direct_forces() -> None:
         action_names=SHIFT_NAMES + GRF_NAMES,
         matrix=tuple(map(tuple, rng.normal(0, 0.3, (24, 28)))),
         action_scale=(0.1,) * 12 + (60.0,) * 12,
-        action_bound=(0.1,) * 12 + (80.0,) * 12,
+        action_bound=(0.1,) * 12 + (20.0,) * 12,
     )
     assert agree("stoch3", chosen, walked()[:120]) & Clamp.WRENCH
 
