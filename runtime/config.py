@@ -138,8 +138,11 @@ def _contradictions(config: Config) -> Iterator[str]:
         )
     if not config.link.allow_unprotected:
         for endpoint in config.link.listen:
-            if not _loopback(endpoint):
-                yield f"link.listen = {endpoint!r}: off the loopback interface needs link.allow_unprotected = true"
+            if not _loopback(endpoint) and not (config.link.certificates and endpoint.startswith("tls/")):
+                yield (
+                    f"link.listen = {endpoint!r}: off the loopback interface needs a tls/ endpoint and"
+                    " link.certificates (trotd keys makes them), or link.allow_unprotected = true"
+                )
 
 
 def _loopback(endpoint: str) -> bool:

@@ -23,6 +23,7 @@ import numpy as np
 import zenoh
 
 from runtime import messages, policies
+from runtime.access import AccessError, control_access, use_certificates
 from runtime.control.parameters import BoundsConfig
 from runtime.control.policy import Policy
 from runtime.control.records import Records, VelocityCommand
@@ -131,8 +132,14 @@ class Link:
         self._loop = asyncio.get_running_loop()
         self._wake = asyncio.Event()
         config = self._config
+        settings = session_config("peer", config.listen, config.connect)
         try:
-            session = zenoh.open(session_config("peer", config.listen, config.connect))
+            if config.certificates:
+                use_certificates(settings, Path(config.certificates))
+                control_access(settings, self._robot)
+            session = zenoh.open(settings)
+        except AccessError as error:
+            raise LinkError(f"link.certificates: {error}") from error
         except zenoh.ZError as error:
             raise LinkError(_one_line(error, config)) from error
         self._session = session

@@ -275,6 +275,7 @@ class Keys:
 
     def __init__(self, robot: str) -> None:
         root = f"trotd/{robot}"
+        self.root = root
         self.status = f"{root}/status"
         self.tick = f"{root}/tick"
         self.tick_schema = f"{root}/tick/schema"

@@ -86,7 +86,9 @@ class LinkConfig(Record, frozen=True, kw_only=True):
     connect: tuple[Endpoint, ...] = ()
     """Routers or peers that the daemon itself looks for."""
     allow_unprotected: bool = False
-    """An endpoint off the loopback interface carries no encryption; it is refused unless this says otherwise."""
+    """An endpoint off the loopback interface without mutual TLS is refused unless this says otherwise."""
+    certificates: str = ""
+    """Folder of the daemon's ``ca.pem``, ``cert.pem`` and ``key.pem``; with it, ``tls/`` endpoints serve by role."""
     batch: Annotated[int, Meta(ge=1, le=100)] = 5
     """Tick records in one message."""
     status_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import msgspec
 import zenoh
 
+from runtime.access import AccessError, use_certificates
 from runtime.messages import Keys, Status
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -28,8 +31,18 @@ class NoAnswer(StationError):
     """Nobody answered in time."""
 
 
+def certificates() -> Path:
+    """Where this user's certificate lies: ``TROTD_CERTIFICATES``, or ``~/.config/trotd/certificates``."""
+    named = os.environ.get("TROTD_CERTIFICATES")
+    return Path(named) if named else Path.home() / ".config" / "trotd" / "certificates"
+
+
 def session_config(endpoint: str) -> zenoh.Config:
-    """A client of the one endpoint that is named; no scouting."""
+    """A client of the one endpoint that is named; no scouting. A ``tls/`` one is shown this user's certificate.
+
+    Raises:
+        StationError: a certificate is needed and not there.
+    """
     config = zenoh.Config()
     for key, value in (
         ("mode", "client"),
@@ -38,6 +51,11 @@ def session_config(endpoint: str) -> zenoh.Config:
         ("scouting/gossip/enabled", False),
     ):
         config.insert_json5(key, json.dumps(value))
+    if endpoint.startswith("tls/"):
+        try:
+            use_certificates(config, certificates())
+        except AccessError as error:
+            raise StationError(f"{endpoint} needs a certificate: {error}") from error
     return config
 
 
@@ -113,7 +131,8 @@ def connected(robot: str, endpoint: str = DEFAULT_ENDPOINT) -> Iterator[Station]
     try:
         session: Any = zenoh.open(session_config(endpoint))
     except zenoh.ZError as error:
-        raise StationError(f"nobody to talk to at {endpoint}: is the daemon running there?") from error
+        why = "does it run there, and does it know this certificate?" if endpoint.startswith("tls/") else "does it run?"
+        raise StationError(f"no daemon to talk to at {endpoint}: {why}") from error
     try:
         yield Station(session, robot, endpoint)
     finally:

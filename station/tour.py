@@ -94,8 +94,8 @@ def plan_tour(config: Config) -> list[Leg]:
         Leg("turn left 0.8", (0.0, 0.0, 0.8), 4.0),
         Leg("turn right 0.8", (0.0, 0.0, -0.8), 4.0),
         Leg("arc", (0.5 * scale, 0.2 * scale, 0.5), 5.0),
-        Leg("push from the right", (0.0, 0.0, 0.0), 4.0, push),
-        Leg("push from the left", (0.0, 0.0, 0.0), 4.0, -push),
+        Leg("push from right", (0.0, 0.0, 0.0), 4.0, push),
+        Leg("push from left", (0.0, 0.0, 0.0), 4.0, -push),
     ]
 
 

@@ -253,6 +253,43 @@ def export(
             typer.echo(f"{path}: {path.stat().st_size} bytes")
 
 
+keys_app = typer.Typer(no_args_is_help=True, help="Certificates: who may see, drive or teach a robot.")
+app.add_typer(keys_app, name="keys")
+AuthorityOption = Annotated[Path, typer.Option("--authority", help="Folder of the authority.", file_okay=False)]
+AUTHORITY = Path("trotd-keys")
+
+
+@keys_app.command("init")
+def init_keys(authority: AuthorityOption = AUTHORITY) -> None:
+    """Make a private certificate authority. Keep its folder off the robot."""
+    from station.keys import make_authority
+
+    with refusals():
+        make_authority(authority)
+        typer.echo(f"{authority}: the authority; its ca-key.pem leaves this machine never")
+
+
+@keys_app.command("add")
+def add_key(
+    role: Annotated[str, typer.Argument(help="robot, viewer, operator or trainer.")],
+    name: Annotated[str, typer.Argument(help="Who bears it.")],
+    host: Annotated[list[str] | None, typer.Option(help="A robot's name or address; may be given again.")] = None,
+    authority: AuthorityOption = AUTHORITY,
+) -> None:
+    """Make a certificate: for the robot, or for a person who sees, drives or teaches it."""
+    from runtime.access import Role
+    from station.keys import add_bearer
+    from station.session import StationError
+
+    with refusals():
+        if role not in list(Role):
+            raise StationError(f"role = {role!r}: must be one of {', '.join(Role)}")
+        folder = add_bearer(authority, Role(role), name, tuple(host or ()))
+        typer.echo(f"{folder}: copy its three files to the bearer")
+        use = "link.certificates in the robot's TOML names it" if role == Role.ROBOT else "TROTD_CERTIFICATES names it"
+        typer.echo(f"  {use}")
+
+
 def register(front: typer.Typer) -> None:
     """Put these commands beside those of the front door."""
     front.add_typer(app)
