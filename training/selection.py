@@ -17,7 +17,7 @@ from training.checkpoint import RunFolder
 from training.contest import Contender, Contest, Outcome, Trial
 from training.randomize import SENSORS, TASK, Conditions, draw
 
-CANDIDATES = 6
+CANDIDATES = 4
 """Checkpoints that are compared: the last ones, evenly spread over the last stage."""
 SEED = 5_000
 """Of the validation set; apart from training's and from the table's."""

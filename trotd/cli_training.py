@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -230,7 +229,7 @@ def _show_table(
         [find_contender(name, beside) for name in names],
         tests,
         workers or os.cpu_count() or 1,
-        lambda who, test, _: print(f"{who}: {test}", file=sys.stderr),  # noqa: T201
+        lambda who, test, _: typer.echo(f"{who}: {test}", err=True),
     )
     typer.echo(report.to_json() if json else report.to_text())
     return report.to_text()
