@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import IO
 
 import msgspec
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.status import Status as Line
 from rich.table import Table
+from rich.text import Text
 
 from runtime.config import Config
 from runtime.messages import Status
@@ -29,8 +31,6 @@ START_TIMEOUT = 180.0
 STOP_TIMEOUT = 15.0
 BAD_INPUT = 2
 """The exit code by which a daemon says so."""
-TABLE_WIDTH = 132
-"""Characters that the report needs; a narrower terminal wraps it."""
 
 
 class DaemonFailed(StationError):
@@ -50,7 +50,6 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
         StationError: the daemon does not start.
     """
     console = Console(stderr=as_json)
-    console = Console(stderr=as_json, width=max(TABLE_WIDTH, console.width))
     with _free_endpoint() as endpoint:
         pass
     with contextlib.ExitStack() as stack:
@@ -96,6 +95,7 @@ def _twin(robot: str, endpoint: str, arguments: Sequence[str]) -> Iterator[list[
         output = stack.enter_context(tempfile.TemporaryFile("w+"))
         toml = arguments[arguments.index("--robot") + 1]
         command = [sys.executable, "-m", "trotd.cli", "twin", "--robot", toml, "--state", folder, "--connect", endpoint]
+        command += ["--rate-hz", arguments[arguments.index("--rate-hz") + 1]]
         child = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         try:
             end = time.monotonic() + START_TIMEOUT
@@ -145,11 +145,11 @@ def _shown(line: Line) -> Callable[[Status | None, str], None]:
         if status is None:
             return
         wanted, measured = status.velocity_command, status.velocity
-        line.update(
-            f"[bold]{activity}[/bold] · {status.mode} · asked {wanted[0]:+.2f} {wanted[1]:+.2f} {wanted[2]:+.2f}"
-            f" · measured {measured[0]:+.2f} {measured[1]:+.2f} {measured[2]:+.2f}"
-            f" · tick {status.tick_p50 * 1e3:.2f}/{status.tick_p99 * 1e3:.2f} ms · overruns {status.overruns}"
+        text = (
+            f"{activity} · {status.mode} · {_triple(wanted)} → {_triple(measured)}"
+            f" · {status.tick_p50 * 1e3:.1f}/{status.tick_p99 * 1e3:.1f} ms · late {status.overruns}"
         )
+        line.update(Text(text, no_wrap=True, overflow="ellipsis"))
 
     return show
 
@@ -181,26 +181,37 @@ def _last_line(output: IO[str]) -> str:
 
 
 def _print(console: Console, report: TourReport) -> None:
-    table = Table(title=f"{report.robot} at {report.rate_hz:g} Hz")
-    for name in ("leg", "asked", "measured", "RMSE", "roll", "pitch", "falls", "estimator", "tick p50/p99", "late", ""):
-        table.add_column(name, no_wrap=True, justify="left" if name in ("leg", "") else "right")
+    table = Table(title=f"{report.robot} at {report.rate_hz:g} Hz", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("leg", "commanded", "measured", "RMSE", "roll", "pitch", "est.", ""):
+        table.add_column(name, no_wrap=name != "", justify="left" if name in ("leg", "") else "right")
     for leg in report.legs:
         table.add_row(
             leg.name,
-            " ".join(f"{value:+.2f}" for value in leg.commanded),
-            " ".join(f"{value:+.2f}" for value in leg.measured),
+            _triple(leg.commanded),
+            _triple(leg.measured),
             f"{leg.rmse:.3f}",
             f"{leg.roll:.2f}",
             f"{leg.pitch:.2f}",
-            str(leg.falls),
             f"{leg.estimator_rmse:.3f}",
-            f"{leg.tick_p50 * 1e3:.2f}/{leg.tick_p99 * 1e3:.2f}",
-            str(leg.overruns),
             "; ".join(leg.problems) or "ok",
         )
     console.print(table)
-    console.print("velocities vx vy m/s, yaw rate rad/s, simulator's truth; RMSE and estimator m/s; tilt rad; tick ms")
+    console.print(
+        "vx, vy m/s and yaw rate rad/s, the simulator's truth; RMSE after 1 s, m/s; worst roll and pitch, rad;"
+        " est.: the estimator's error, m/s"
+    )
     for problem in report.problems:
         console.print(f"problem: {problem}", style="red", markup=False)
+    if report.legs:
+        median = sorted(leg.tick_p50 for leg in report.legs)[len(report.legs) // 2]
+        worst = max(leg.tick_p99 for leg in report.legs)
+        console.print(
+            f"falls {sum(leg.falls for leg in report.legs)} · tick p50 {median * 1e3:.2f} ms, p99 {worst * 1e3:.2f} ms"
+            f" · overruns {sum(leg.overruns for leg in report.legs)}"
+        )
     console.print(f"recording: {report.recording}", soft_wrap=True)
     console.print(f"{'passed' if report.passed else 'FAILED'} in {report.seconds:.0f} s", style="bold")
+
+
+def _triple(values: Sequence[float]) -> str:
+    return " ".join(f"{value + 0.0:5.2f}" for value in values)
