@@ -41,6 +41,10 @@ class ServoWire:
         self._by_id = {(bus, servo.id): servo for bus, members in self.servos.items() for servo in members}
         self.faults = WireFaults()
         self.counters = BusCounters()
+        self.asked: set[tuple[int, int]] = set()
+        """(bus, arbitration id) of the frames since somebody last looked: all servos' means a tick is complete."""
+        self.ticked = asyncio.Event()
+        """Set when every servo was addressed once more."""
         self._clock = clock
         self._random = np.random.default_rng(seed)
         self._channels: dict[int, Channel] = {}
@@ -88,11 +92,16 @@ class ServoWire:
 
     def _readable(self, bus: int) -> None:
         for identifier, data in self._channels[bus].read():
+            if (bus, identifier & 0x7F) in self._by_id:
+                self.asked.add((bus, identifier))
             for reply in self.answer((bus, identifier, data)):
                 if self.faults.delay:
                     asyncio.get_running_loop().call_later(self.faults.delay, self._send, reply)
                 else:
                     self._send(reply)
+        if len(self.asked) >= len(self._by_id):
+            self.asked.clear()
+            self.ticked.set()
 
     def _send(self, reply: Frame) -> None:
         bus, identifier, data = reply

@@ -41,7 +41,8 @@ REAL_NOISE = Noise(
     linear_acceleration_bias=0.02,
 )
 """What servos and an MTi show; the encoders' steps are the emulators'."""
-_MOST_CATCHING_UP = 8
+_PATIENCE = 4
+"""Ticks without frames after which the twin lives by the clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,13 +115,11 @@ class TwinBody:
 
 
 class WireTwin:
-    """A ``TwinBody`` on real channels and a real pseudo-terminal, in real time. Use inside a running loop."""
+    """A ``TwinBody`` on real channels and a real pseudo-terminal. Use inside a running loop."""
 
     def __init__(self, world: World, setup: TwinSetup, imu_path: Path) -> None:
         self.body = TwinBody(world, setup)
         self.imu = SerialImu(imu_path, setup.product, setup.imu_baud)
-        self.late_steps = 0
-        """Steps that were skipped because the computer was too slow: the twin then lives slower than the clock."""
 
     def open(self, bus: BusConfig) -> None:
         """Listen on the buses, plug in the IMU.
@@ -136,23 +135,28 @@ class WireTwin:
         self.body.wire.close()
         self.imu.unplug()
 
-    async def run(self, after_step: Callable[[], None] = lambda: None) -> None:
-        """Live until cancelled."""
-        period = self.body.world.period
-        next_step = time.monotonic()
+    async def run(self, tick: float, after_step: Callable[[], None] = lambda: None) -> None:
+        """Live until cancelled: one ``tick``, s, for each round of frames to all servos, or by the clock without any.
+
+        So a computer that is too slow slows the twin's time, as it slows that of ``SimRobot``, and does not fell it.
+        """
+        body, ticked = self.body, self.body.wire.ticked
+        steps = max(1, round(tick / body.world.period))
         while True:
-            next_step += period
-            ahead = next_step - time.monotonic()
-            if ahead < -_MOST_CATCHING_UP * period:
-                self.late_steps += round(-ahead / period)
-                next_step = time.monotonic()
-            await asyncio.sleep(max(0.0, ahead))
-            measurement = self.body.step()
-            self.imu.measure(next_step, *self.body.felt(measurement.imu))
-            after_step()
+            try:
+                async with asyncio.timeout(_PATIENCE * tick):
+                    await ticked.wait()
+                count = steps
+            except TimeoutError:
+                count = _PATIENCE * steps
+            ticked.clear()
+            for _ in range(count):
+                measurement = body.step()
+                self.imu.measure(time.monotonic(), *body.felt(measurement.imu))
+                after_step()
 
 
-async def run_twin(twin: WireTwin, bus: BusConfig, after_step: Callable[[], None] = lambda: None) -> None:
+async def run_twin(twin: WireTwin, bus: BusConfig, tick: float, after_step: Callable[[], None] = lambda: None) -> None:
     """Open, live until cancelled, close.
 
     Raises:
@@ -160,7 +164,7 @@ async def run_twin(twin: WireTwin, bus: BusConfig, after_step: Callable[[], None
     """
     twin.open(bus)
     try:
-        await twin.run(after_step)
+        await twin.run(tick, after_step)
     finally:
         twin.close()
 

@@ -148,7 +148,7 @@ async def _check_joints(config: Config, wires: Wires) -> list[Row]:
     finally:
         await motors.close()
     lower, upper = np.array(config.robot.joints.lower), np.array(config.robot.joints.upper)
-    position = motors.joint_state().position
+    position, margin = motors.joint_state().position, config.limits.joint_margin
     return [
         Row(
             joint_name(leg, joint),
@@ -156,7 +156,7 @@ async def _check_joints(config: Config, wires: Wires) -> list[Row]:
             f"at {position[leg, joint]:.2f} rad, range {lower[leg, joint]:g} to {upper[leg, joint]:g}",
             "move it inside; if it is inside, its zero is wrong: power up folded, or trotd commission",
         )
-        for leg, joint in np.argwhere((position < lower) | (position > upper))
+        for leg, joint in np.argwhere((position < lower - margin) | (position > upper + margin))
     ] or [Row("joints", "ok", "all inside their ranges")]
 
 

@@ -46,6 +46,7 @@ def twin(
     ] = None,
     product: Annotated[str, typer.Option(help="Of the IMU: MTI-610 (no orientation), MTI-620, MTI-630.")] = "MTI-630",
     noise: Annotated[bool, typer.Option(help="Sensors as noisy as real ones.")] = True,
+    rate_hz: Annotated[float | None, typer.Option(help="The daemon's, where it is not the robot's own.")] = None,
     folder: StateOption = None,
 ) -> None:
     """Be the robot's body on wires: servos on a CAN bus over UDP, an IMU on a pseudo-terminal, moved by the simulator.
@@ -59,7 +60,8 @@ def twin(
 
         if product not in ("MTI-610", "MTI-620", "MTI-630"):
             raise ValueError(f"--product {product}: MTI-610, MTI-620 or MTI-630")
-        loaded = config.load(config.find_robot(robot))
+        changes = {} if rate_hz is None else {"control.rate_hz": rate_hz}
+        loaded = config.override(config.load(config.find_robot(robot)), "command line", changes)
         serve_twin(loaded, folder or state_folder(), connect, TwinOptions(scramble, product, noise))  # type: ignore[arg-type]
 
 

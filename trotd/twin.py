@@ -70,12 +70,15 @@ def serve_twin(config: Config, folder: Path, endpoint: str, options: TwinOptions
     pose = Posture(config.robot, config.control, config.posture).folded_joints
     scenario = Scenario(joint_position=pose, noise=REAL_NOISE if options.noise else Noise())
     twin = WireTwin(world, TwinSetup(build, wires.motors, scenario, options.product), meeting / IMU_LINK)
-    bus = twin_wires(wires, meeting, port, 0.01).bus
+    bus = twin_wires(wires, meeting, port).bus
     place = meeting / MEETING
     favour(0)
     try:
         with _told(config.robot.name, endpoint, world) as tell:
-            live = _live(lambda: run_twin(twin, bus, tell), lambda: place.write_text(json.dumps({"port": port})))
+            live = _live(
+                lambda: run_twin(twin, bus, 1.0 / config.control.rate_hz, tell),
+                lambda: place.write_text(json.dumps({"port": port})),
+            )
             with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
                 runner.run(live)
     finally:

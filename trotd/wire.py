@@ -19,11 +19,9 @@ from drivers.hardware import HardwareRobot
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
 from runtime.config import Config
 
-TWIN_REPLY_SHARE = 0.8
-"""Of a tick: how long a twin's replies are waited for. Its process shares the computer with everybody."""
-TWIN_COASTED_TICKS = 10
-"""Missed replies that are no fault of a twin: they are the computer's, which does two robots' work at once."""
-TWIN_MAX_AGE = 0.1
+TWIN_REPLY_TIME = 0.1
+"""How long a twin's replies are waited for, s: its process shares the computer with everybody, and its time with us."""
+TWIN_MAX_AGE = 0.25
 """The guard's bound on ages for a twin, s: what kernel workers of a busy computer keep a terminal's bytes."""
 MEETING, IMU_LINK, KNOWN = "wire.json", "imu", "calibration.json"
 _GROUPS = "239.74.163.{}"
@@ -62,7 +60,7 @@ def wires_of(kind: str, config: Config, folder: Path) -> Wires:
         port = int(json.loads((meeting / MEETING).read_bytes())["port"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DriverError(f"no twin of {config.robot.name!r} in {meeting}: start it with trotd twin") from error
-    return twin_wires(wires, meeting, port, TWIN_REPLY_SHARE / config.control.rate_hz)
+    return twin_wires(wires, meeting, port)
 
 
 def own_wires(config: Config) -> Wires:
@@ -76,12 +74,11 @@ def own_wires(config: Config) -> Wires:
     return Wires(config.bus, config.motors, config.imu)
 
 
-def twin_wires(wires: Wires, meeting: Path, port: int, reply_timeout: float) -> Wires:
+def twin_wires(wires: Wires, meeting: Path, port: int) -> Wires:
     """The twin's: one multicast group a bus, from UDP ``port`` up, the IMU at the end of a pseudo-terminal."""
     channels = tuple(_GROUPS.format(bus + 2) for bus in range(len(wires.bus.channels)))
-    bus = BusConfig(backend="udp_multicast", channels=channels, port=port, reply_timeout=reply_timeout)
-    motors = msgspec.structs.replace(wires.motors, coasted_ticks=TWIN_COASTED_TICKS)
-    return Wires(bus, motors, msgspec.structs.replace(wires.imu, port=str(meeting / IMU_LINK)))
+    bus = BusConfig(backend="udp_multicast", channels=channels, port=port, reply_timeout=TWIN_REPLY_TIME)
+    return Wires(bus, wires.motors, msgspec.structs.replace(wires.imu, port=str(meeting / IMU_LINK)))
 
 
 def wired_body(kind: str, config: Config, folder: Path, observe: bool) -> HardwareRobot:
