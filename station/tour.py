@@ -17,7 +17,7 @@ import zenoh
 from drivers.robot import Array
 from runtime.config import Config
 from runtime.control.records import Records
-from runtime.messages import Event, Mode, ModeReply, Request, SimPush, SimTruth, Status
+from runtime.messages import Clamp, Event, Mode, ModeReply, Request, SimPush, SimTruth, Status
 from station.session import Station, StationError
 from station.ticks import TickStream
 
@@ -242,7 +242,11 @@ class Tour:
             problems=[],
         )
         last = error[stamps[counted] > stamps[-1] - SETTLE]
-        return msgspec.structs.replace(result, problems=self._missed(leg, result, _planar_rms(last)))
+        problems = self._missed(leg, result, _planar_rms(last))
+        expired = int(((ticks["clamps"] & np.uint32(Clamp.EXPIRED)) != 0).sum())
+        if problems and expired:
+            problems.append(f"no fresh command on {expired} ticks: this computer is too busy")
+        return msgspec.structs.replace(result, problems=problems)
 
     def _missed(self, leg: Leg, result: LegResult, last_second: float) -> list[str]:
         """Bounds that were missed; a pushed robot only has to be itself again in the last second."""
