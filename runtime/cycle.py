@@ -129,13 +129,10 @@ class Cycle:
     def warm_up(self, measurement: Measurement) -> None:
         """Run every path of a tick once, so that nothing compiles later; leaves the state as it was."""
         self.guard.reset()
-        self.controller.reset(measurement)
-        for standing in (False, True):
-            self.controller.step(measurement, self._rest, standing)
+        self.controller.warm_up(measurement)
         self.posture.stand_up(measurement)
         self.posture.step()
         self.posture.reset()
-        self.controller.reset(measurement)
         self.tick[:] = 0
 
     def step(self, wake: Wake, measurement: Measurement) -> JointCommand:

@@ -200,6 +200,21 @@ class Controller:
         self.state["foot_targets"] = self.record["feet"]
         self.state["joint_targets"] = measurement.joints.position
 
+    def warm_up(self, measurement: Measurement) -> None:
+        """Take every path of a step once, those of failure too, so that nothing compiles later; ends in a reset.
+
+        ``measurement`` must come from the body that will be used: arrays of another layout in memory would be compiled
+        for anew, which takes seconds.
+        """
+        self.reset(measurement)
+        for standing in (False, True):
+            self.step(measurement, VelocityCommand(), standing)
+        for problem in self.problems[1:]:
+            problem.hessian[...] = np.eye(len(problem.gradient))
+            problem.gradient[...] = -problem.min_force
+            self.ladder.warm_up(problem)
+        self.reset(measurement)
+
     def estimate(self, measurement: Measurement) -> None:
         """Keep the estimate warm in modes that do not step."""
         imu, joints = measurement.imu, measurement.joints

@@ -167,6 +167,12 @@ class Ladder:
             return force, SolverStatus.SOLVED
         return self.fall_back(problem)
 
+    def warm_up(self, problem: GrfProblem) -> None:
+        """Take every step on a problem that has a solution."""
+        self.solve(problem)
+        self.fall_back(problem)
+        clipped_least_squares(*problem)
+
     def ask_first(self, problem: GrfProblem) -> Array | None:
         """What the first solver says; the caller is to hold it against ``grf.accept``."""
         return _guarded(self.first, problem)
