@@ -71,6 +71,10 @@ SERVE = StagePlan(
 )  # fmt: skip
 """From a walk to one that follows commands and takes pushes."""
 POLISH = msgspec.structs.replace(SERVE, name="polish", iterations=60, learning_rate_end=0.004)
+REFINE = msgspec.structs.replace(
+    SERVE, name="refine", iterations=60, stdev=0.03, learning_rate=0.01, learning_rate_end=0.001
+)
+"""From numbers that already walk: smaller steps, or what they know is lost before anything is learnt."""
 ROUGHEN = StagePlan(
     name="roughen", reward="task", iterations=40, directions=48, ticks=700, conditions="rough", symmetry="both",
     stdev=0.05, stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.003, fall_weight=2.5,
@@ -90,8 +94,10 @@ def make_plan(
     rough: bool,
     reference: str = "rigid-body",
 ) -> RunPlan:
-    """The plan of a ``trotd train``: both stages from nothing, the paper's letter, or fine-tuning on rough ground."""
+    """The plan of a ``trotd train``: from nothing, from a policy's numbers, by the paper's letter, or on rough ground."""
     stages: tuple[StagePlan, ...] = (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, POLISH)
+    if start and not paper and not rough:
+        stages = (REFINE,)
     if variant.endswith("plain"):  # commands mean nothing to it: it can only imitate one
         stages = tuple(stage for stage in stages if stage.reward == "table") or stages
     return msgspec.convert(

@@ -69,7 +69,7 @@ def train(
     ] = "linear",
     paper: Annotated[bool, typer.Option("--paper", help="The paper's letter: one stage, no fixed terms.")] = False,
     rough: Annotated[bool, typer.Option("--rough", help="Fine-tune --start on uneven ground.")] = False,
-    start: Annotated[str | None, typer.Option(help="Policy to start from, instead of zero.")] = None,
+    start: Annotated[str | None, typer.Option(help="Policy to refine, instead of beginning at zero.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Of every stage, instead of the plan's.", min=1)] = None,
     directions: Annotated[int | None, typer.Option(help="Of every stage, instead of the plan's.", min=1)] = None,
     ticks: Annotated[int | None, typer.Option(help="Of every episode, instead of the plan's.", min=1)] = None,
