@@ -24,7 +24,7 @@ from runtime.config import Config
 from runtime.messages import Status
 from station.session import Station, StationError, connected
 from station.tour import Tour, TourReport
-from trotd.wire import MEETING, favour, twin_folder
+from trotd.wire import MEETING, twin_folder
 
 START_TIMEOUT = 180.0
 """s; the first start of all compiles the core."""
@@ -63,8 +63,6 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
             stdout=output,
             stderr=subprocess.STDOUT,
         )
-        if wire:
-            favour(child.pid)
         try:
             with (
                 _reach(config.robot.name, endpoint, child, output) as station,

@@ -104,7 +104,7 @@ def lenient(config: Config) -> Config:
 def favour(process: int) -> None:
     """Let the main thread of ``process`` (0: this one) run before ordinary ones, where the kernel grants it.
 
-    A twin and its daemon keep each other's time; a compiler beside them must not look like a dead motor.
+    For the twin alone: a daemon favoured as well starves the kernel's workers that carry the terminal's bytes.
     """
     with contextlib.suppress(OSError):
         os.sched_setscheduler(process, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
