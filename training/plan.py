@@ -94,7 +94,7 @@ def make_plan(
     rough: bool,
     reference: str = "rigid-body",
 ) -> RunPlan:
-    """The plan of a ``trotd train``: from nothing, from a policy's numbers, by the paper's letter, or on rough ground."""
+    """The plan of a ``trotd train`` from nothing, from a policy's numbers, by the paper's letter or on rough ground."""
     stages: tuple[StagePlan, ...] = (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, POLISH)
     if start and not paper and not rough:
         stages = (REFINE,)
