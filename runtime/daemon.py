@@ -351,6 +351,16 @@ class Daemon:
         """Remember a policy for the next start. On zenoh's thread: it waits for the disk."""
         state.write_whole(self._policy_file, data)
 
+    def previous_policy(self) -> bytes:
+        """The file of the policy that was active before this one.
+
+        Raises:
+            PolicyError: there was none since the start.
+        """
+        if not self._policies_before:
+            raise policies.PolicyError("no policy was active before this one")
+        return self._policies_before[max(self._policies_before)]
+
     def active_policy(self) -> tuple[str, bytes]:
         """Name and file of the active policy."""
         return self.cycle.policy.name, self._policy_bytes

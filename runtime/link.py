@@ -64,6 +64,7 @@ class Doors(Protocol):
     def take_policy(self, policy: Policy, data: bytes) -> None: ...  # noqa: D102
     def refuse(self, door: str, why: str) -> None: ...  # noqa: D102
     def active_policy(self) -> tuple[str, bytes]: ...  # noqa: D102
+    def previous_policy(self) -> bytes: ...  # noqa: D102
     def keep_policy(self, data: bytes) -> None: ...  # noqa: D102
     def record_now(self, reason: str, done: Future[Path]) -> None: ...  # noqa: D102
     def status(self) -> Status: ...  # noqa: D102
@@ -312,10 +313,13 @@ class Link:
 
     def _answer_policy(self, query: zenoh.Query) -> bytes:
         data = _payload(query)
-        if not data:
+        rollback = "rollback" in query.parameters
+        if not data and not rollback:
             return self._cross(self._doors.active_policy).result(ANSWER_TIMEOUT)[1]
         accepted, why = True, "active"
         try:
+            if rollback:
+                data = self._cross(self._doors.previous_policy).result(ANSWER_TIMEOUT)
             policy = policies.decode(data, self._robot, "candidate")
             self._cross(lambda: self._doors.take_policy(policy, data)).result(ANSWER_TIMEOUT)
             self._doors.keep_policy(data)

@@ -42,6 +42,11 @@ if [ -z "$python" ]; then
 fi
 [ -n "$python" ] || fail "no Python 3.11 with venv: apt install python3 python3-venv"
 
+# The solvers' wheels are linked against the OpenMP runtime, which a minimal Debian lacks.
+if ! ldconfig -p | grep -q 'libgomp\.so\.1'; then
+    apt-get install --yes --quiet --no-install-recommends libgomp1 >/dev/null || fail "libgomp.so.1 is missing: apt install libgomp1"
+fi
+
 root=/opt/trotd
 new=$root/versions/$(date +%Y%m%dT%H%M%S)
 old=$(readlink "$root/current" 2>/dev/null || true)
@@ -55,7 +60,7 @@ abandon() { rm -rf "$new"; }
 trap abandon EXIT
 $python -m venv "$new"
 "$new/bin/pip" install --quiet --disable-pip-version-check --constraint "$source/constraints.txt" "$source[$extras]"
-"$new/bin/trotd" --help >/dev/null || fail "the new version does not even start"
+"$new/bin/python" -c 'import runtime.daemon, trotd.cli' || fail "the new version does not even import"
 trap - EXIT
 
 install -d -m 0750 -g trotd /etc/trotd
