@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run run-wire test check bench format clean
+.PHONY: run run-wire test test-service check bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
@@ -18,6 +18,9 @@ run-wire: $(VENV)/.sim
 
 test: $(VENV)/.dev
 	$(BIN)/pytest $(PYTEST_ARGS)
+
+test-service: $(VENV)/.dev
+	tests/service.sh
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
