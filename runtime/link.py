@@ -90,6 +90,7 @@ def session_config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> 
         ("connect/endpoints", list(connect)),
         ("scouting/multicast/enabled", False),
         ("scouting/gossip/enabled", False),
+        ("transport/shared_memory/enabled", False),  # gains nothing below 2 kB; a confined service may not have it
     ):
         config.insert_json5(key, json.dumps(value))
     return config
