@@ -99,8 +99,9 @@ def build_qp(p, t, com, buffer, gradient):  # type: ignore[no-untyped-def]
             block[2, 0] = -2.0 * h[4] * rx * sz
             block[2, 1] = -2.0 * h[3] * ry * sz
             block[2, 2] = 2.0 * (h[2] + h[3] * ry * sy + h[4] * rx * sx)
-            if k > i:
-                hessian[3 * k : 3 * k + 3, 3 * i : 3 * i + 3] = block.T
+            for a in range(3 if k > i else 0):
+                for c in range(3):
+                    hessian[3 * k + c, 3 * i + a] = block[a, c]
         for j in range(3):
             hessian[3 * i + j, 3 * i + j] += 2.0 * p.force_weight
     return legs if finite else -1

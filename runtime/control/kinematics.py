@@ -128,7 +128,7 @@ def angles_of_leg(g, leg, foot, q):  # type: ignore[no-untyped-def]
     square = y * y + z * z - l1 * l1
     reached = square > 1e-8
     c = math.sqrt(square) if reached else 1e-4
-    q[0] = _wrapped(math.atan2(z, y) - math.atan2(-c, l1))
+    q[0] = math.atan2(z * l1 + c * y, y * l1 - c * z)  # atan2(z, y) - atan2(-c, l1) in one
     length = math.sqrt(x * x + c * c)
     longest = REACH_MARGIN * (l2 + l3)
     shortest = abs(l2 - l3) + (1.0 - REACH_MARGIN) * (l2 + l3)
@@ -136,15 +136,11 @@ def angles_of_leg(g, leg, foot, q):  # type: ignore[no-untyped-def]
         reached = False
         bounded = longest if length > longest else shortest
         x, c, length = x * bounded / length, c * bounded / length, bounded
-    cosine = (length * length - l2 * l2 - l3 * l3) / (2.0 * l2 * l3)
-    q[2] = -math.acos(min(1.0, max(-1.0, cosine)))
-    q[1] = math.atan2(-x, c) - math.atan2(l3 * math.sin(q[2]), l2 + l3 * math.cos(q[2]))
+    cosine = min(1.0, max(-1.0, (length * length - l2 * l2 - l3 * l3) / (2.0 * l2 * l3)))
+    along, across = l2 + l3 * cosine, -l3 * math.sqrt(1.0 - cosine * cosine)  # of the shank's end, seen from the thigh
+    q[1] = math.atan2(-x * along - c * across, c * along - x * across)
+    q[2] = -math.acos(cosine)
     return reached
-
-
-@compiled
-def _wrapped(angle):  # type: ignore[no-untyped-def]
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @compiled

@@ -132,8 +132,9 @@ def act(p, policy, s, t):  # type: ignore[no-untyped-def]
                 out[a] += policy.readout[a, h] * total
     else:
         for i in range(28):
+            seen = t.observation[i]
             for a in range(24):
-                out[a] += policy.matrix[i, a] * t.observation[i]
+                out[a] += policy.matrix[i, a] * seen
     for a in range(actions):
         out[a] *= policy.action_scale[a]
     for leg in range(4):
