@@ -11,7 +11,7 @@ import numpy as np
 from runtime import config
 from runtime.control.grf import GrfProblem, build_qp
 from runtime.control.records import CONTROL_DTYPE
-from runtime.control.state import PARAMETERS_DTYPE, build_parameters
+from runtime.control.state import build_parameters
 
 KINDS = ("trot", "walk", "stand", "one leg", "none", "extreme", "slope", "hostile")
 STANCES = {
@@ -94,7 +94,5 @@ def _tilt(roll: float, pitch: float) -> np.ndarray:
     c, s = np.cos(roll), np.sin(roll)
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     c, s = np.cos(pitch), np.sin(pitch)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) @ about_x
-
-
-assert PARAMETERS_DTYPE.names
+    turned: np.ndarray = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) @ about_x
+    return turned

@@ -12,10 +12,12 @@ from collections.abc import Iterator
 import daqp
 import numpy as np
 import proxsuite
+from numpy.typing import NDArray
 
 from drivers.robot import Array
 from runtime.control.grf import GrfProblem
 
+Extended = NDArray[np.longdouble]
 FEASIBLE = 1e-10
 """Violation of a constraint, N, that still counts as none."""
 STATIONARY = 1e-11
@@ -54,7 +56,7 @@ def exact_forces(problem: GrfProblem) -> Array:
     raise NotExact(f"no proven minimum of a problem with {len(problem.gradient)} variables")
 
 
-def is_minimum(problem: GrfProblem, force: Array, multipliers: Array) -> bool:
+def is_minimum(problem: GrfProblem, force: Array | Extended, multipliers: Array | Extended) -> bool:
     """Whether forces (3n,) and multipliers (6n,) of ``constraints`` meet the conditions of Karush, Kuhn and Tucker."""
     rows, limits = constraints(problem)
     slack = limits - rows @ force
@@ -67,7 +69,7 @@ def is_minimum(problem: GrfProblem, force: Array, multipliers: Array) -> bool:
     )
 
 
-def _equations(problem: GrfProblem, rows: Array, limits: Array, active: Array) -> tuple[Array, Array]:
+def _equations(problem: GrfProblem, rows: Array, limits: Array, active: NDArray[np.bool_]) -> tuple[Extended, Extended]:
     """Forces and multipliers with the ``active`` rows as equations, refined in extended precision."""
     n, chosen = len(problem.gradient), rows[active]
     size = n + len(chosen)
@@ -83,7 +85,7 @@ def _equations(problem: GrfProblem, rows: Array, limits: Array, active: Array) -
     return solution[:n], multipliers
 
 
-def _guesses(problem: GrfProblem, rows: Array, limits: Array) -> Iterator[Array]:
+def _guesses(problem: GrfProblem, rows: Array, limits: Array) -> Iterator[NDArray[np.bool_]]:
     lower = np.full(len(limits), -1e30)
     sense = np.zeros(len(limits), np.int32)
     _, _, flag, info = daqp.solve(

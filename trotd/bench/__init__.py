@@ -1,0 +1,1 @@
+"""``trotd bench``: what the numbers in docs/performance.md come from. Ratios are measured side by side in one run."""
