@@ -61,7 +61,7 @@ FAULTS: dict[str, tuple[str, Any]] = {
 def test_each_fault_turns_its_own_check_and_no_other(name: str) -> None:
     field, value = FAULTS[name]
     ticks = healthy()
-    ticks[field][-30:] = value
+    ticks[field][-30 if name != "compute" else 0 :] = value
     found = levels(ticks)
     assert found.pop(name) is Level.BAD
     assert set(found.values()) == {Level.OK}
@@ -83,6 +83,12 @@ def test_a_slow_robot_is_told_from_a_lossy_link() -> None:
     lossy = healthy()[::3]
     found = levels(lossy, lost=N - len(lossy))
     assert found["rate"] is Level.OK and found["link"] is Level.BAD
+
+
+def test_a_few_slow_ticks_are_a_warning_as_long_as_most_are_quick() -> None:
+    ticks = healthy()
+    ticks["compute"][-30:] = 0.006
+    assert levels(ticks)["compute"] is Level.WARNING
 
 
 def test_a_fault_that_stands_is_bad() -> None:
