@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -165,7 +166,9 @@ def _reached(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> Iter
 @contextlib.contextmanager
 def _driven(station: Station, subscribers: int) -> Iterator[None]:
     """Armed, stood up and walking; the operator's command is kept fresh from a thread."""
-    heard = [station.session.declare_subscriber(station.keys.tick, lambda _sample: None) for _ in range(subscribers)]
+    heard: list[Any] = [
+        station.session.declare_subscriber(station.keys.tick, lambda _sample: None) for _ in range(subscribers)
+    ]
     for word, mode in (("arm", "DAMP"), ("stand", "STAND"), ("walk", "WALK")):
         station.ask(station.keys.mode, word.encode())
         while station.next_status().mode != mode:

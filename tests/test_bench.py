@@ -1,0 +1,111 @@
+"""The bench's own honesty: its corpus, its exact answers, its verdicts and what it prints."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trotd.bench import command, qp, report, tick
+from trotd.bench.corpus import KINDS, Corpus
+from trotd.bench.exact import constraints, exact_forces, is_minimum
+
+
+def test_corpus_is_the_same_for_the_same_seed_and_has_every_kind_and_number_of_legs() -> None:
+    first = list(Corpus(3).cases(400))
+    again = list(Corpus(3).cases(400))
+    other = list(Corpus(4).cases(400))
+    assert [case.problem.gradient.tobytes() for case in first] == [case.problem.gradient.tobytes() for case in again]
+    assert [case.problem.gradient.tobytes() for case in first] != [case.problem.gradient.tobytes() for case in other]
+    assert set(Counter(case.kind for case in first)) == set(KINDS)
+    assert {case.legs for case in first} == {0, 1, 2, 3, 4}
+
+
+def test_corpus_has_problems_with_and_without_a_bound_that_binds() -> None:
+    free = bound = 0
+    for case in Corpus(3).cases(400):
+        if case.legs > 0:
+            slope = case.problem.hessian @ exact_forces(case.problem) + case.problem.gradient
+            free, bound = free + (np.abs(slope).max() < 1e-8), bound + (np.abs(slope).max() > 1e-3)
+    assert free > 40 and bound > 100
+
+
+def test_exact_forces_are_no_worse_than_any_neighbour_in_the_feasible_set() -> None:
+    rng = np.random.default_rng(0)
+    for case in Corpus(5).cases(160):
+        if case.legs <= 0:
+            continue
+        problem = case.problem
+        best = exact_forces(problem)
+        rows, limits = constraints(problem)
+        assert (rows @ best - limits).max() <= 1e-9
+
+        def cost(force: np.ndarray, q: Any = problem.hessian, c: Any = problem.gradient) -> float:
+            return float(0.5 * force @ q @ force + c @ force)
+
+        for size in (1e-3, 1.0, 100.0):
+            other = (best + size * rng.normal(size=best.shape)).reshape(-1, 3)
+            other[:, 2] = np.clip(other[:, 2], problem.min_force, problem.max_force)
+            side = problem.friction * other[:, 2:]
+            other[:, :2] = np.clip(other[:, :2], -side, side)
+            assert cost(other.ravel()) >= cost(best) - 1e-9 * abs(cost(best))
+
+
+def test_a_wrong_answer_proves_nothing() -> None:
+    case = next(case for case in Corpus(5).cases(10) if case.legs == 2)
+    best = exact_forces(case.problem)
+    assert not is_minimum(case.problem, best + 1e-3, np.zeros(12))
+    assert not is_minimum(case.problem, best, np.full(12, -1.0))
+
+
+def test_force_section_on_a_small_corpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(qp, "Corpus", lambda seed: _Few(seed))
+    found = [finding for finding in qp.measure(quick=True) if isinstance(finding, report.Figure)]
+    assert len(found) == 5
+    assert all(figure.met for figure in found)
+
+
+class _Few(Corpus):
+    def cases(self, count: int) -> Any:
+        return super().cases(160)
+
+
+def figure(value: float, bound: float | None = None, sense: Any = "<=") -> report.Figure:
+    return report.Figure("tick", "a step", value, "µs", bound, sense)
+
+
+def test_a_bound_is_met_or_missed_in_its_sense() -> None:
+    assert figure(1.0).met is None
+    assert figure(1.0, 1.0).met is True and figure(1.1, 1.0).met is False
+    assert figure(1.0, 1.0, ">=").met is True and figure(0.9, 1.0, ">=").met is False
+    assert figure(float("nan"), 1.0).met is False
+
+
+def test_a_missed_bound_fails_the_run_and_the_json_says_which(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    findings = [figure(1.0, 2.0), figure(3.0, 2.0), report.Missing("timer", "beside cyclictest", "not installed")]
+    monkeypatch.setattr(command, "measure", lambda section, quick: iter(findings))
+    assert not command.bench([command.Section.TICK], quick=True, json=True)
+    rows = json.loads(capsys.readouterr().out)["figures"]
+    assert [row.get("met") for row in rows] == [True, False, None]
+    assert rows[2]["missing"] == "not installed"
+    findings.pop(1)
+    assert command.bench([command.Section.TICK], quick=True, json=False)
+    assert "not installed" in capsys.readouterr().out
+
+
+def test_without_the_tests_the_plain_form_is_missing_and_not_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tick, "PLAIN", Path("/nowhere/plain.py"))
+    walked: Any = None
+    (found,) = tick.against_plain(walked, 1)
+    assert isinstance(found, report.Missing) and "plain.py" in found.why
+
+
+def test_bars_are_not_drawn_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(report.shown(range(3), "counting", 3)) == [0, 1, 2]
+    assert capsys.readouterr() == ("", "")
