@@ -127,6 +127,7 @@ class PlainController:
     def reset(self, measurement: Measurement) -> None:
         zero = np.zeros
         self.contacts, self.swinging, self.searching = zero(4, bool), zero(4, bool), zero(4, bool)
+        self.pressure, self.lifted, self.x = zero(4), zero(4, bool), zero((5, 3))
         self.stance, self.phase, self.clock = np.ones(4, bool), np.full(4, np.pi), 1.0 - 1e-9
         self.started, self.first_height = False, True
         self.position, self.slope, self.rested = zero(3), zero(2), zero(4)
@@ -175,9 +176,9 @@ class PlainController:
             ]
         )
         self.record["contact_force"] = force @ self.rotation.T
-        self.feel_contacts(self.record["contact_force"][:, 2])
         in_world = feet @ self.to_world.T
         odometry, rolling = self.leg_odometry(q, joints.velocity, rate, feet)
+        self.feel_contacts(self.record["contact_force"][:, 2], odometry)
         if not self.started:
             self.x = np.vstack([np.zeros(3), in_world])  # rows: velocity, then the four feet; columns: world axes
             self.covariance = np.diag([0.1] + [noise.foot_position_noise**2] * 4)
@@ -213,11 +214,16 @@ class PlainController:
             slope=self.slope,
         )
 
-    def feel_contacts(self, force: Array) -> None:
+    def feel_contacts(self, force: Array, odometry: Array) -> None:
         contact = self.config.contact
-        bound = np.where(self.contacts, contact.release * contact.threshold, contact.threshold)
-        blind = ~self.contacts & self.swinging & (self.phase < contact.blanking * np.pi)
-        self.contacts = (force > bound) & ~blind
+        follow = self.dt / (self.dt + contact.force_time_constant) if self.started else 1.0
+        self.pressure = self.pressure + (force - self.pressure) * follow
+        blind = self.swinging & (self.phase < contact.blanking * np.pi)
+        begins = (np.minimum(force, self.pressure) > contact.threshold) & ~blind
+        felt = np.where(self.contacts, force > contact.release * contact.threshold, begins)
+        moving = np.linalg.norm(odometry - self.x[0], axis=1) > contact.lift_speed
+        self.lifted = moving & (felt & ~moving).any()
+        self.contacts = felt & ~self.lifted
 
     def leg_odometry(self, q: Array, speed: Array, rate: Array, feet: Array) -> tuple[Array, Array]:
         """Velocity of the body that each rolling foot tells, and that of the rolling foot's centre; world. (4, 3)."""
@@ -341,6 +347,8 @@ class PlainController:
                 self.phase[leg], self.swinging[leg], self.searching[leg] = progress, True, False
             elif self.contacts[leg]:
                 self.searching[leg] = False
+            elif self.lifted[leg]:
+                self.searching[leg] = True
         if standing and not self.swinging.any():
             self.clock = 1.0 - 1e-9
         self.was, self.stance = self.stance, ~(self.swinging | self.searching)

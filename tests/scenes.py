@@ -12,7 +12,7 @@ from runtime import config
 from runtime.control.controller import Controller
 from runtime.control.policy import Policy, policy_record
 from runtime.control.records import CONTROL_DTYPE
-from runtime.control.state import STATE_DTYPE, build_parameters, stand_angles
+from runtime.control.state import STATE_DTYPE, WORK_DTYPE, build_parameters, stand_angles
 from runtime.policies import find_policy, load
 
 ROBOTS = ("stoch3", "mini_cheetah", "a1")
@@ -156,6 +156,7 @@ class Workbench:
         self.state = np.zeros(1, STATE_DTYPE)
         self.record = np.zeros(1, CONTROL_DTYPE)
         self.policies = policy_record(chosen or policy(name))
+        self.work = np.zeros(1, WORK_DTYPE)
 
     @property
     def p(self) -> Any:
@@ -168,6 +169,10 @@ class Workbench:
     @property
     def t(self) -> Any:
         return self.record.view(np.recarray)[0]
+
+    @property
+    def m(self) -> Any:
+        return self.work.view(np.recarray)[0]
 
     @property
     def chosen(self) -> Any:

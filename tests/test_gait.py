@@ -138,3 +138,15 @@ def test_a_searching_leg_swings_again_at_its_next_turn() -> None:
     cycle = round(float(known.p.cycle_time) / float(known.p.dt))
     found = run(known, cycle + 5, contacts=np.zeros(4))
     assert found["searching"][cycle - 2, 0] and found["swinging"][-1, 0] and not found["searching"][-1, 0]
+
+
+def test_a_stance_leg_whose_foot_lifted_searches_and_is_not_loaded() -> None:
+    bench = Workbench()
+    bench.s.stance[:] = 1
+    bench.s.contacts[:] = (0, 1, 1, 1)
+    bench.s.lifted[0] = 1
+    advance_gait(bench.p, bench.s, bench.t, True)
+    assert bench.t.stance.tolist() == [0, 1, 1, 1]
+    bench.s.lifted[0], bench.s.contacts[0] = 0, 1
+    advance_gait(bench.p, bench.s, bench.t, True)
+    assert bench.t.stance.tolist() == [1, 1, 1, 1]

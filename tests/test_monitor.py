@@ -32,6 +32,7 @@ def status(**changes: Any) -> Status:
         "mode": "STAND",
         "fault": "",
         "reason": "",
+        "health": "",
     }
     triples = dict.fromkeys(("velocity_command", "velocity", "rpy"), (0.0, 0.0, 0.0))
     return msgspec.convert(

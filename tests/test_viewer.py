@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scenes import quaternion, robot, rotation
+from walks import Walk
 
 from runtime import recorder
 from runtime.control.kinematics import forward, leg_geometry
 from runtime.messages import TICK_DTYPE, tick_schema
 from runtime.recorder import RecordingError
-from scenes import quaternion, robot, rotation
 from station import ticks as station_ticks
 from station.canvas import SCENE_HZ, Canvas
 from station.pose import heading_to_world, leg_points, orientation_xyzw
 from station.session import StationError
 from station.viewer import Screen, view_recording
-from walks import Walk
 
 rr = pytest.importorskip("rerun")
 

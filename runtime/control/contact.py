@@ -28,10 +28,28 @@ def foot_force(gravity, torque, jacobian, force):  # type: ignore[no-untyped-def
 
 
 @compiled
-def feel_contacts(p, s, t):  # type: ignore[no-untyped-def]
-    """Contact of every foot from the vertical force, with hysteresis; early in a swing none can begin, only end."""
+def feel_contacts(p, s, t, m):  # type: ignore[no-untyped-def]
+    """Contact of every foot from the vertical force, with hysteresis; early in a swing none can begin, only end.
+
+    Contact begins on the low-passed force: the inertia of a swinging leg tells forces of its own that change sign from
+    tick to tick, a landing does not. A foot that moves over the ground while another one rests is in the air whatever
+    its torque says (``lifted``): the force that an unloaded leg is given feels like ground until the leg has run away.
+    """
+    follow = p.dt / (p.dt + p.force_time_constant)
+    resting = 0
     for leg in range(4):
-        bound = p.contact_release if s.contacts[leg] else p.contact_threshold
-        blind = not s.contacts[leg] and s.swinging[leg] and s.phase[leg] < p.contact_blanking
-        s.contacts[leg] = t.contact_force[leg, 2] > bound and not blind
+        force = t.contact_force[leg, 2]
+        s.pressure[leg] += (force - s.pressure[leg]) * (follow if s.started else 1.0)
+        if s.contacts[leg]:
+            s.contacts[leg] = force > p.contact_release
+        else:
+            blind = s.swinging[leg] and s.phase[leg] < p.contact_blanking
+            s.contacts[leg] = min(force, s.pressure[leg]) > p.contact_threshold and not blind
+        dx, dy = m.odometry[leg, 0] - s.velocity[0], m.odometry[leg, 1] - s.velocity[1]
+        dz = m.odometry[leg, 2] - s.velocity[2]
+        s.lifted[leg] = dx * dx + dy * dy + dz * dz > p.lift_speed * p.lift_speed
+        resting += s.contacts[leg] and not s.lifted[leg]
+    for leg in range(4):
+        s.lifted[leg] = s.lifted[leg] and resting > 0
+        s.contacts[leg] = s.contacts[leg] and not s.lifted[leg]
         t.contacts[leg] = s.contacts[leg]

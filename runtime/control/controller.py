@@ -53,7 +53,7 @@ def sense(memory, record, orientation, rate, acceleration, position, velocity, t
     m.joints[0], m.joints[1], m.joints[2] = position, velocity, torque
     states[1] = states[0]
     estimate(c.parameters, c.geometry, states[0], t, m)
-    finite = np.isfinite(t.height + t.rpy.sum() + t.twist.sum() + t.feet.sum())
+    finite = np.isfinite(t.height + t.rpy.sum() + t.twist.sum() + t.feet.sum() + t.contact_force.sum())
     if not finite:
         states[0] = states[1]
     return finite
@@ -213,6 +213,7 @@ class Controller:
             problem.hessian[...] = np.eye(len(problem.gradient))
             problem.gradient[...] = -problem.min_force
             self.ladder.warm_up(problem)
+        carry_out(*self._memory, self._no_force, IDLE, False, np.empty((5, 4, 3)))  # no leg in stance: mid-walk only
         self.reset(measurement)
 
     def estimate(self, measurement: Measurement) -> None:

@@ -87,7 +87,7 @@ def estimate(p, g, s, t, m):  # type: ignore[no-untyped-def]
         foot_force(m.gravity, m.joints[2, leg], m.jacobian[leg], m.force)
         times(rotation, m.force, t.contact_force[leg])
         _leg_odometry(g, m, leg, sines)
-    feel_contacts(p, s, t)
+    feel_contacts(p, s, t, m)
     if not s.started:
         _start(p, s, m.foot_in_world)
     _predict(p, s, m)

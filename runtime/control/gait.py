@@ -48,8 +48,8 @@ def advance_gait(p, s, t, standing):  # type: ignore[no-untyped-def]
     """Move the clock by one tick and decide swing and stance of every leg.
 
     A leg swings through its window; after mid-swing a felt contact ends the swing early; a leg that found no ground at
-    its window's end searches and is not loaded. While ``standing`` no new swing begins, and once all legs stand the
-    clock waits at the cycle's start.
+    its window's end searches and is not loaded, and so does one whose foot lifted. While ``standing`` no new swing
+    begins, and once all legs stand the clock waits at the cycle's start.
     """
     before = s.clock
     s.clock = (before + p.dt / p.cycle_time) % 1.0
@@ -71,6 +71,8 @@ def advance_gait(p, s, t, standing):  # type: ignore[no-untyped-def]
             t.phase[leg] = math.pi * share / p.swing_fraction
         elif s.contacts[leg]:
             s.searching[leg] = 0
+        elif s.lifted[leg]:
+            s.searching[leg] = 1
         s.phase[leg] = t.phase[leg]
         t.stance[leg] = not (s.swinging[leg] or s.searching[leg])
     if standing and not s.swinging.any():

@@ -57,6 +57,10 @@ class ContactConfig(Record, frozen=True, kw_only=True):
     """Contact is lost below this share of the threshold."""
     blanking: Fraction = 0.5
     """Share of the swing, from liftoff, in which no contact is believed."""
+    force_time_constant: NonNegative = 0.005
+    """Low-pass of the force that begins a contact, s."""
+    lift_speed: Positive = 1.5
+    """A foot that moves faster over the ground, while another one rests, is in the air, m/s."""
 
 
 class GrfConfig(Record, frozen=True, kw_only=True):

@@ -46,6 +46,8 @@ STATE_DTYPE = np.dtype(
     [
         # contact
         ("contacts", "u1", (4,)),
+        ("pressure", "f8", (4,)),  # low-passed vertical force, N
+        ("lifted", "u1", (4,)),  # the foot moves over the ground
         # estimator
         ("started", "u1"),
         ("velocity", "f8", (3,)),  # of the body origin in the world, m/s
@@ -109,6 +111,8 @@ PARAMETERS_DTYPE = np.dtype(
         ("contact_threshold", "f8"),
         ("contact_release", "f8"),
         ("contact_blanking", "f8"),
+        ("force_time_constant", "f8"),
+        ("lift_speed", "f8"),
         # estimator
         ("acceleration_noise", "f8"),
         ("foot_position_noise", "f8"),
@@ -183,6 +187,7 @@ def build_parameters(description: RobotDescription, config: ControlConfig) -> Re
         p[name] = getattr(gains, name)
     p["contact_threshold"], p["contact_release"] = contact.threshold, contact.release * contact.threshold
     p["contact_blanking"] = contact.blanking * np.pi
+    p["force_time_constant"], p["lift_speed"] = contact.force_time_constant, contact.lift_speed
     for name in config.estimator.__struct_fields__:
         p[name] = getattr(config.estimator, name)
     for name in ("friction", "min_force", "max_force", "wrench_weight", "force_weight"):
