@@ -213,7 +213,7 @@ class Controller:
             problem.hessian[...] = np.eye(len(problem.gradient))
             problem.gradient[...] = -problem.min_force
             self.ladder.warm_up(problem)
-        carry_out(*self._memory, self._no_force, IDLE, False, np.empty((5, 4, 3)))  # no leg in stance: mid-walk only
+        carry_out(*self._memory, self._no_force, FAILED, False, np.empty((5, 4, 3)))  # in a walk: no stance, no force
         self.reset(measurement)
 
     def estimate(self, measurement: Measurement) -> None:
