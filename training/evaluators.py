@@ -5,6 +5,7 @@ Each worker keeps one ``Stage`` and computes with one BLAS thread; what a run ha
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -107,6 +108,8 @@ class Processes:
 
 
 _stage: Stage | None = None
+PR_SET_PDEATHSIG = 1
+"""Linux: which signal a process gets when its parent dies."""
 
 
 def _enter(setup: Setup) -> None:
@@ -115,6 +118,7 @@ def _enter(setup: Setup) -> None:
 
     global _stage
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the trainer's: it finishes what is begun
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a killed trainer leaves no worker behind
     _stage = Stage(setup)
 
 
