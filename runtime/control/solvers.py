@@ -38,15 +38,14 @@ class DaqpSolver:
         import daqp
 
         self._model: Callable[[], Any] = daqp.Model
-        self._models: dict[int, tuple[tuple[float, float, float], Any, Array]] = {}
+        self._models: dict[int, tuple[GrfProblem, Any, Array]] = {}
 
     def solve(self, problem: GrfProblem) -> Array | None:
         """See ``GrfSolver``. ``sense`` is cleared each time, so the result is a pure function of the problem."""
         n = len(problem.gradient)
-        bounds = problem[2:]
         known = self._models.pop(n, None)  # put back on success alone: whatever went wrong may have left it broken
-        if known is None or known[0] != bounds:
-            known = (bounds, self._setup(problem), np.zeros(n + PYRAMID_ROWS * n // 3, np.int32))
+        if known is None or (known[0] is not problem and known[0][2:] != problem[2:]):
+            known = (problem, self._setup(problem), np.zeros(n + PYRAMID_ROWS * n // 3, np.int32))
         _, model, sense = known
         if model.update(problem.hessian, problem.gradient, None, None, None, sense) < 0:
             return None
