@@ -10,7 +10,7 @@ from scenes import Workbench, robot, rotation
 
 from runtime.control.kinematics import forward, inverse, jacobians, leg_geometry
 from runtime.control.records import Clamp
-from runtime.control.state import WORK_DTYPE, stand_angles
+from runtime.control.state import stand_angles
 from runtime.control.torque import command_joints, damp_joints
 
 TABLE = leg_geometry(robot().robot)
@@ -23,8 +23,6 @@ class Bench(Workbench):
 
     def __init__(self, rpy: Any = (0.0, 0.0, 0.0)) -> None:
         super().__init__()
-        self.work = np.zeros(1, WORK_DTYPE)
-        self.m = self.work.view(np.recarray)[0]
         self.m.rotation = rotation(rpy)
         self.m.jacobian = jacobians(TABLE, STAND)
         self.t.stance = self.s.stance = 1
