@@ -70,7 +70,7 @@ def test_bad_arguments_are_one_line_and_code_2(tmp_path: Path, arguments: list[s
 def test_nobody_to_talk_to_is_code_1() -> None:
     result = trotd("arm", "--connect", free_endpoint())
     assert result.returncode == 1
-    assert "is the daemon running there?" in one_line(result)
+    assert "no daemon to talk to at" in one_line(result)
 
 
 def test_help_teaches() -> None:
