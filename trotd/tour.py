@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import IO
 
 import msgspec
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.status import Status as Line
 from rich.table import Table
@@ -179,7 +178,7 @@ def _last_line(output: IO[str]) -> str:
 
 
 def _print(console: Console, report: TourReport) -> None:
-    table = Table(title=f"{report.robot} at {report.rate_hz:g} Hz", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=f"{report.robot} at {report.rate_hz:g} Hz", box=None, padding=(0, 1, 0, 0))
     for name in ("leg", "commanded", "measured", "RMSE", "roll", "pitch", "est.", ""):
         table.add_column(name, no_wrap=name != "", justify="left" if name in ("leg", "") else "right")
     for leg in report.legs:
@@ -212,4 +211,4 @@ def _print(console: Console, report: TourReport) -> None:
 
 
 def _triple(values: Sequence[float]) -> str:
-    return " ".join(f"{value + 0.0:5.2f}" for value in values)
+    return " ".join(f"{value:.2f}" for value in values)
