@@ -192,7 +192,7 @@ class Daemon:
         fed = 0
         command = damp_command(self.config.damp.kd)
         realtime.settle_garbage()
-        with Ticker(self.config.control.rate_hz) as ticker:
+        with Ticker(self.config.control.rate_hz, self.config.realtime.early_wake) as ticker:
             while not stop.is_set():
                 index = await ticker.wait()
                 wake = Wake(index, ticker.stamp, ticker.elapsed, ticker.lateness, ticker.overruns)

@@ -2,6 +2,9 @@
 
 The deadlines are ``start + k·period`` for ever: a late tick does not move the ones after it. ``wait`` wakes once for
 every readable timer; when more than one deadline went by, the difference is the overruns.
+
+A sleeping thread wakes some 30 to 150 µs after its timer. A ticker may therefore be woken ``early`` and wait out the
+rest awake: what the kernel takes to wake it then no longer shows, at the cost of that time of one processor.
 """
 
 from __future__ import annotations
@@ -49,7 +52,14 @@ def timerfd(first: int, period: int) -> int:
 class Ticker:
     """Wakes its one waiter at a fixed rate. Use as a context manager inside a running loop."""
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, early: float = 0.0) -> None:
+        """Tick at ``rate_hz``, woken ``early`` s before every deadline and awake until it.
+
+        Raises:
+            ValueError: ``early`` is negative or more than half a period.
+        """
+        if not 0.0 <= early <= 0.5 / rate_hz:
+            raise ValueError(f"early = {early:g} s, bound half of the period {1.0 / rate_hz:g} s")
         self.period = 1.0 / rate_hz
         """Between two deadlines, s."""
         self.index = 0
@@ -63,6 +73,7 @@ class Ticker:
         self.lateness = 0.0
         """Between the last deadline and the wake, s."""
         self._period_ns = round(NANOSECONDS / rate_hz)
+        self._early_ns = round(NANOSECONDS * early)
         self._start_ns = 0
         self._pending = 0
         self._fd = -1
@@ -73,7 +84,7 @@ class Ticker:
         self._loop = asyncio.get_running_loop()
         self._start_ns = time.monotonic_ns()
         self.stamp = self._start_ns / NANOSECONDS
-        self._fd = timerfd(self._start_ns + self._period_ns, self._period_ns)
+        self._fd = timerfd(self._start_ns + self._period_ns - self._early_ns, self._period_ns)
         self._loop.add_reader(self._fd, self._expired)
         return self
 
@@ -98,11 +109,14 @@ class Ticker:
         self.index += self._pending
         self.overruns += self._pending - 1
         self._pending = 0
+        deadline = self._start_ns + self.index * self._period_ns
         now = time.monotonic_ns()
+        while now < deadline:
+            now = time.monotonic_ns()
         stamp = now / NANOSECONDS
         self.elapsed = stamp - self.stamp
         self.stamp = stamp
-        self.lateness = (now - self._start_ns - self.index * self._period_ns) / NANOSECONDS
+        self.lateness = (now - deadline) / NANOSECONDS
         return self.index
 
     def _expired(self) -> None:

@@ -111,3 +111,26 @@ def test_cancelling_the_waiter_ends_it() -> None:
                 await task
 
     run(uvloop.new_event_loop, main())
+
+
+@pytest.mark.parametrize("loop_factory", LOOPS)
+def test_a_ticker_woken_early_is_awake_at_the_deadline_and_never_before_it(
+    loop_factory: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
+    async def main() -> None:
+        with Ticker(100.0, early=0.005) as ticker:
+            late = []
+            for _ in range(30):
+                await ticker.wait()
+                late.append(ticker.lateness)
+            assert min(late) >= 0.0
+            assert sorted(late)[10] < 2e-5, "a third of the wakes beat a deadline that is 5 ms away"
+            assert ticker.index == 30 + ticker.overruns
+
+    run(loop_factory, main())
+
+
+@pytest.mark.parametrize("early", [-1e-6, 0.0051])
+def test_more_than_half_a_period_of_waking_early_is_refused(early: float) -> None:
+    with pytest.raises(ValueError, match=r"bound half of the period 0\.01 s"):
+        Ticker(100.0, early)
