@@ -9,14 +9,11 @@ import asyncio
 import contextlib
 import hashlib
 import logging
-import platform
 import signal
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +25,10 @@ from runtime.config import Config
 from runtime.control.policy import Policy, encode_policy
 from runtime.control.records import Clamp, SolverStatus, VelocityCommand
 from runtime.cycle import Cycle, Wake
+from runtime.flight_log import FlightLog
 from runtime.link import Channel, Link
 from runtime.messages import Keys, Mode, ModeReply, Request, Status
 from runtime.modes import Reason
-from runtime.recorder import Header, Recorder, layout
 from runtime.systemd import Notifier
 from runtime.ticker import Ticker
 
@@ -39,9 +36,6 @@ log = logging.getLogger("trotd")
 
 DAMP_REPLIES = 3
 """Exchanges that must come back before a stopping daemon believes that the body damps."""
-POLICIES_BEFORE = 8
-"""Files of policies no longer active that a recording still takes along."""
-VERSIONED = ("trotd", "numpy", "numba", "daqp", "msgspec", "eclipse-zenoh")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,23 +64,13 @@ class Daemon:
         self.cycle = Cycle(job.config, job.policy)
         self.measurement: Measurement | None = None
         """The last one that came back."""
-        recorder = job.config.recorder
-        self.recorder = Recorder(
-            job.folder / "recordings" / job.config.robot.name,
-            job.config.control.rate_hz,
-            recorder.seconds,
-            recorder.max_files,
-            recorder.max_bytes,
-        )
-        self.recordings: list[Path] = []
-        """Written by this daemon."""
+        self.flight = FlightLog(job.config, job.robot_toml, job.folder, self.cycle)
         self._policy_bytes = encode_policy(job.policy)
-        self._policies_before: dict[int, bytes] = {}
+        self._policy_before: bytes | None = None
+        self.flight.take_policy(self.cycle.generation, self._policy_bytes)
         self._policy_file = job.folder / "policies" / f"{job.config.robot.name}.json"
         self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
         self._stop: asyncio.Event | None = None
-        self._write_due: asyncio.Event
-        self._writes: deque[tuple[int, str, Future[Path] | None]] = deque()
         self._held = False
 
     async def run(self) -> None:
@@ -96,7 +80,7 @@ class Daemon:
             AlreadyRunning, LinkError, DriverError, RealtimeError: it could not start.
             ExceptionGroup: what broke the loop, after the body was damped.
         """
-        self._stop, self._write_due = asyncio.Event(), asyncio.Event()
+        self._stop = asyncio.Event()
         notifier = Notifier()
         with state.lock(self.job.folder, self.config.robot.name), contextlib.closing(notifier), self._signals():
             async with self._connected(), self._linked():
@@ -134,7 +118,7 @@ class Daemon:
             config.robot.name,
             config.control.rate_hz,
             self,
-            self.recorder.folder,
+            self.flight.recorder.folder,
             self.job.channels(keys),
         )
         try:
@@ -175,7 +159,7 @@ class Daemon:
         try:
             async with asyncio.TaskGroup() as group:
                 sender = group.create_task(self.link.run(), name="link")
-                writer = group.create_task(self._write_recordings(), name="recordings")
+                writer = group.create_task(self.flight.run(), name="recordings")
                 await self._control(notifier)
                 sender.cancel()
                 writer.cancel()
@@ -187,7 +171,7 @@ class Daemon:
     async def _control(self, notifier: Notifier) -> None:
         """The loop: one exchange and one step of the cycle a tick."""
         assert self._stop is not None
-        stop, cycle, body, recorder, link = self._stop, self.cycle, self.job.body, self.recorder, self.link
+        stop, cycle, body, flight, link = self._stop, self.cycle, self.job.body, self.flight, self.link
         feed_every = max(1, round(notifier.watchdog_period * self.config.control.rate_hz))
         fed = 0
         command = damp_command(self.config.damp.kd)
@@ -204,18 +188,14 @@ class Daemon:
                     command = cycle.step(wake, measurement)
                 compute = time.monotonic() - ticker.stamp
                 cycle.tick["compute"] = compute
-                self._compute[recorder.count % len(self._compute)] = compute
-                recorder.keep(cycle.tick)
+                self._compute[flight.recorder.count % len(self._compute)] = compute
+                flight.keep()
                 link.offer(cycle.tick)
-                if recorder.count % recorder.keyframe_every == 1 % recorder.keyframe_every:
-                    recorder.keep_keyframe(cycle.remember())
-                if recorder.count == 1:
+                if flight.recorder.count == 1:
                     self.job.ready()
                     notifier.tell("READY=1")
                 if cycle.events:
                     self._tell_events()
-                if self._writes and self._writes[0][0] <= recorder.count:
-                    self._write_due.set()
                 if notifier.watchdog_period and index - fed >= feed_every:  # the index jumps where a tick was missed
                     fed = index
                     notifier.tell("WATCHDOG=1")
@@ -242,15 +222,7 @@ class Daemon:
         """The loop is over: say so, keep the recording."""
         self.cycle.damp(Reason.STOPPING)
         self._tell_events()
-        for _, _, done in self._writes:
-            if done is not None:
-                done.set_exception(OSError("the daemon is stopping"))
-        self._writes.clear()
-        try:
-            if self.recorder.count:
-                self._write("stop")
-        except OSError as error:
-            log.error("recording: %s", error)
+        self.flight.finish()
         self._tell_events()
         self.link.flush()
 
@@ -259,12 +231,9 @@ class Daemon:
     def _tell_events(self) -> None:
         while self.cycle.events:
             event = self.cycle.events.popleft()
-            self.recorder.events.append(event)
+            self.flight.take_event(event)
             self.link.tell(event)
             log.info("%s: %s", event.kind, event.text)
-            if event.kind == "fault":
-                after = round(self.config.recorder.after_fault * self.config.control.rate_hz)
-                self._writes.append((self.recorder.count + after, "fault", None))
         if self.config.realtime.freeze_garbage:
             self._hold_garbage(self.cycle.state.armed)
 
@@ -272,44 +241,6 @@ class Daemon:
         if hold != self._held:
             self._held = hold
             realtime.hold_garbage(hold)
-
-    async def _write_recordings(self) -> None:
-        while True:
-            await self._write_due.wait()
-            self._write_due.clear()
-            while self._writes and self._writes[0][0] <= self.recorder.count:
-                _, reason, done = self._writes.popleft()
-                try:
-                    path = await asyncio.to_thread(self._write, reason)
-                except OSError as error:
-                    self.cycle.note("recording", f"not written: {error}")
-                    if done is not None:
-                        done.set_exception(error)
-                else:
-                    if done is not None:
-                        done.set_result(path)
-
-    def _write(self, reason: str) -> Path:
-        now = time.time()
-        stamp = time.strftime("%Y%m%dT%H%M%S", time.localtime(now)) + f"-{int(now * 1000) % 1000:03d}"
-        header = Header(
-            robot=self.config.robot.name,
-            robot_toml=self.job.robot_toml,
-            policy=self._policy_bytes.decode(),
-            rate_hz=self.config.control.rate_hz,
-            reason=reason,
-            written=time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(now)),
-            versions=versions(),
-            layout=layout(),
-            itemsize=self.cycle.tick.dtype.itemsize,
-            events=list(self.recorder.events),
-            keyframes=self.recorder.keyframes(),
-            policies={generation: data.decode() for generation, data in self._policies_before.items()},
-        )
-        path = self.recorder.write(header, f"{stamp}-{reason.replace(' ', '-')}")
-        self.recordings.append(path)
-        self.cycle.note("recording", f"{reason}: {path}")
-        return path
 
     def _load_kept_policy(self) -> None:
         """The last policy that was sent and accepted, if it still can be used."""
@@ -343,11 +274,9 @@ class Daemon:
 
     def take_policy(self, policy: Policy, data: bytes) -> None:
         """Make a verified policy the active one."""
-        self._policies_before[self.cycle.generation] = self._policy_bytes
-        if len(self._policies_before) > POLICIES_BEFORE:
-            del self._policies_before[min(self._policies_before)]
         self.cycle.swap_policy(policy)
-        self._policy_bytes = data
+        self._policy_before, self._policy_bytes = self._policy_bytes, data
+        self.flight.take_policy(self.cycle.generation, data)
 
     def keep_policy(self, data: bytes) -> None:
         """Remember a policy for the next start. On zenoh's thread: it waits for the disk."""
@@ -359,9 +288,9 @@ class Daemon:
         Raises:
             PolicyError: there was none since the start.
         """
-        if not self._policies_before:
+        if self._policy_before is None:
             raise policies.PolicyError("no policy was active before this one")
-        return self._policies_before[max(self._policies_before)]
+        return self._policy_before
 
     def active_policy(self) -> tuple[str, bytes]:
         """Name and file of the active policy."""
@@ -373,13 +302,13 @@ class Daemon:
 
     def record_now(self, reason: str, done: Future[Path]) -> None:
         """Write a recording with the next tick."""
-        self._writes.appendleft((self.recorder.count, reason, done))
+        self.flight.ask(reason, done)
 
     def status(self) -> Status:
         """Everything that people want to see."""
         cycle = self.cycle
         tick, current = cycle.tick[0], cycle.state
-        seen = self._compute[: min(len(self._compute), max(1, self.recorder.count))]
+        seen = self._compute[: min(len(self._compute), max(1, self.flight.recorder.count))]
         p50, p99 = np.percentile(seen, (50, 99))
         return Status(
             robot=self.config.robot.name,
@@ -408,15 +337,6 @@ class Daemon:
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
     x, y, z = values.tolist()
     return x, y, z
-
-
-def versions() -> dict[str, str]:
-    """What a replay must have been run with."""
-    found = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in VERSIONED:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
 
 
 def main(job: Job) -> Daemon:

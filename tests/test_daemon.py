@@ -213,11 +213,11 @@ def test_a_fault_is_recorded_with_all_that_a_replay_needs(tmp_path: Path) -> Non
         served.body.change = break_motor
         await served.reach(Mode.DAMP)
         async with asyncio.timeout(10):
-            while not served.daemon.recordings:  # noqa: ASYNC110
+            while not served.daemon.flight.written:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
 
     served = serve(tmp_path, act)
-    recording = load(served.daemon.recordings[0])
+    recording = load(served.daemon.flight.written[0])
     header, ticks = recording.header, recording.ticks
     assert header.reason == "fault"
     assert any("BL hip: a motor reports a fault (code 7)" in event.text for event in header.events)
@@ -228,7 +228,7 @@ def test_a_fault_is_recorded_with_all_that_a_replay_needs(tmp_path: Path) -> Non
     assert len(faulty) >= 2, "it ran on after the fault"
     assert (faulty["mode"] == Mode.DAMP).all() and not faulty["command_kp"].any()
     assert (ticks["mode"] == Mode.WALK).any()
-    assert load(served.daemon.recordings[-1]).header.reason == "stop"
+    assert load(served.daemon.flight.written[-1]).header.reason == "stop"
 
 
 def test_a_recording_is_written_when_asked_for(tmp_path: Path) -> None:
@@ -376,6 +376,6 @@ def test_events_of_a_whole_run_are_in_the_recording(tmp_path: Path) -> None:
         assert isinstance(served.daemon.take_request(Request.DAMP), ModeReply)
 
     served = serve(tmp_path, act)
-    texts = [event.text for event in load(served.daemon.recordings[-1]).header.events if isinstance(event, Event)]
+    texts = [event.text for event in load(served.daemon.flight.written[-1]).header.events if isinstance(event, Event)]
     assert "DAMP -> STAND_UP: asked for" in texts
     assert "STAND -> DAMP: asked for" in texts

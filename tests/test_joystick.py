@@ -291,7 +291,7 @@ def test_a_driver_that_leaves_makes_a_walking_robot_stand(tmp_path: Path) -> Non
 def test_a_driver_that_leaves_moves_nothing_that_does_not_walk(tmp_path: Path) -> None:
     async def play() -> None:
         async with Served(make_config(), tmp_path) as served:
-            await _until(lambda: served.daemon.recorder.count > 2)
+            await _until(lambda: served.daemon.flight.recorder.count > 2)
             assert served.daemon.take_request(Request.ARM).accepted
             await served.client(
                 lambda station: station.session.liveliness().declare_token(f"{station.keys.operator}/1").undeclare()

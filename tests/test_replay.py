@@ -130,7 +130,7 @@ def test_what_a_daemon_recorded_replays(tmp_path: Path) -> None:
             await asyncio.sleep(0.4)
             assert served.daemon.take_request(Request.STAND).accepted
             await asyncio.sleep(0.3)
-            return served.daemon._write("test")
+            return served.daemon.flight.write("test")
 
     path = asyncio.run(play())
     recording = recorder.load(path)

@@ -52,7 +52,7 @@ def test_it_walks_takes_a_push_and_sits_down(tmp_path: Path, monkeypatch: pytest
     assert forward.measured[0] == pytest.approx(0.4, abs=0.1)
     assert push.roll > 2.0 * forward.roll, "the push was felt"
     assert forward.estimator_rmse < 0.1
-    ticks = load(served.daemon.recordings[-1]).ticks
+    ticks = load(served.daemon.flight.written[-1]).ticks
     assert [Mode(mode) for mode in ticks["mode"][np.flatnonzero(np.diff(ticks["mode"], prepend=255))]] == [
         Mode.DAMP,
         Mode.STAND_UP,

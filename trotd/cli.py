@@ -121,7 +121,7 @@ def run(
             config = lenient(config)
         part = build_body(body, config, path, place, observe)
         job = daemon.Job(config, path.read_text(), chosen, part.robot, place, part.channels, _say_ready)
-        for written in daemon.main(job).recordings:
+        for written in daemon.main(job).flight.written:
             typer.echo(f"recording: {written}")
 
 
