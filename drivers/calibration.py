@@ -7,7 +7,6 @@ of another wiring, of an older or a newer format, or from the future is refused:
 from __future__ import annotations
 
 import hashlib
-import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers.description import Name, PerLeg, Record, RobotDescription
+from drivers.durable import write_whole
 from drivers.errors import DriverError
 from drivers.wiring import ImuConfig, MotorsConfig, PerLegBuses, PerLegDirections, PerLegIds, Quaternion
 
@@ -70,14 +70,7 @@ def seal(calibration: Calibration) -> Calibration:
 
 def save(calibration: Calibration, path: Path) -> None:
     """Write it, sealed; the old file stays whole until the new one is."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data = msgspec.json.format(msgspec.json.encode(seal(calibration)), indent=1)
-    scratch = path.with_name(path.name + ".new")
-    with scratch.open("wb") as file:
-        file.write(data + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-    scratch.replace(path)
+    write_whole(path, msgspec.json.format(msgspec.json.encode(seal(calibration)), indent=1) + b"\n")
 
 
 def load(path: Path, description: RobotDescription, motors: MotorsConfig, now: datetime | None = None) -> Calibration:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.durable import write_whole
 from drivers.errors import BusTimeout, CorruptFrame, DriverError
 from drivers.robot import Measurement, Robot, damp_command
 from runtime import policies, realtime, state
@@ -53,6 +54,8 @@ class Job:
     """Keys that belong to this body alone."""
     ready: Callable[[], None] = field(default=lambda: None)
     """Called once, after the first tick."""
+    memory: Path | None = None
+    """Where the ring of ticks lies: a folder that is kept in RAM spares the disk. Without one, the state folder."""
 
 
 class Daemon:
@@ -64,11 +67,13 @@ class Daemon:
         self.cycle = Cycle(job.config, job.policy)
         self.measurement: Measurement | None = None
         """The last one that came back."""
-        self.flight = FlightLog(job.config, job.robot_toml, job.folder, self.cycle)
+        name = job.config.robot.name
+        memory = (job.memory or job.folder / "memory") / name
+        self.flight = FlightLog(job.config, job.robot_toml, job.folder / "recordings" / name, memory, self.cycle)
         self._policy_bytes = encode_policy(job.policy)
         self._policy_before: bytes | None = None
         self.flight.take_policy(self.cycle.generation, self._policy_bytes)
-        self._policy_file = job.folder / "policies" / f"{job.config.robot.name}.json"
+        self._policy_file = job.folder / "policies" / f"{name}.json"
         self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
         self._stop: asyncio.Event | None = None
         self._held = False
@@ -82,7 +87,8 @@ class Daemon:
         """
         self._stop = asyncio.Event()
         notifier = Notifier()
-        with state.lock(self.job.folder, self.config.robot.name), contextlib.closing(notifier), self._signals():
+        alone = state.lock(self.job.folder, self.config.robot.name)
+        with alone, contextlib.closing(notifier), self._signals(), self.flight.open():
             async with self._connected(), self._linked():
                 await self._serve(notifier)
 
@@ -118,7 +124,7 @@ class Daemon:
             config.robot.name,
             config.control.rate_hz,
             self,
-            self.flight.recorder.folder,
+            self.flight.folder,
             self.job.channels(keys),
         )
         try:
@@ -280,7 +286,7 @@ class Daemon:
 
     def keep_policy(self, data: bytes) -> None:
         """Remember a policy for the next start. On zenoh's thread: it waits for the disk."""
-        state.write_whole(self._policy_file, data)
+        write_whole(self._policy_file, data)
 
     def previous_policy(self) -> bytes:
         """The file of the policy that was active before this one.
@@ -331,6 +337,7 @@ class Daemon:
             tick_p99=float(p99),
             clamps={str(clamp.name): int(n) for clamp, n in zip(Clamp, cycle.clamps, strict=True) if n},
             solver={status.name: int(n) for status, n in zip(SolverStatus, cycle.solver, strict=True) if n},
+            recordings_refused=dict(self.flight.refused),
         )
 
 

@@ -40,7 +40,7 @@ from runtime.messages import (
     Status,
 )
 from runtime.parameters import LinkConfig
-from runtime.recorder import list_recordings
+from runtime.recording import list_recordings
 
 HISTORY = 200
 """Events that a query on ``event`` brings back."""

@@ -126,6 +126,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """How often each clamp acted since the start."""
     solver: dict[str, int]
     """How often each solver status came since the start."""
+    recordings_refused: dict[str, int] = {}
+    """How often the flight recorder could not write, by the reason."""
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):

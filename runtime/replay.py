@@ -20,7 +20,7 @@ from runtime.control.records import COMMAND_FIELDS, ESTIMATE_FIELDS, FEET_FIELDS
 from runtime.cycle import KEYFRAME_DTYPE, Cycle, Wake
 from runtime.messages import TICK_DTYPE, Mode, Request
 from runtime.modes import Reason
-from runtime.recorder import Recording, RecordingError
+from runtime.recording import Recording, RecordingError
 
 STAGES: dict[str, tuple[str, ...]] = {
     "mode": ("mode", "armed", "reason", "policy", "asked_velocity"),

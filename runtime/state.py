@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,12 +44,22 @@ def lock(folder: Path, robot: str) -> Iterator[None]:
         yield
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Replace a file by ``data``, whole or not at all, and on the disk when this returns."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.part")
-    with unfinished.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    unfinished.replace(path)
+def memory_folder(state: Path) -> Path:
+    """Where that lies which must outlive the process but need not outlive the machine's power.
+
+    systemd's RUNTIME_DIRECTORY, ``$XDG_RUNTIME_DIR/trotd``, or ``/dev/shm/trotd-<uid>``, all kept in RAM; in it a
+    folder of its own for every state folder.
+
+    Raises:
+        OSError: it is somebody else's.
+    """
+    if granted := os.environ.get("RUNTIME_DIRECTORY"):
+        root = Path(granted.partition(":")[0])
+    elif own := os.environ.get("XDG_RUNTIME_DIR"):
+        root = Path(own) / "trotd"
+    else:
+        root = Path("/dev/shm") / f"trotd-{os.getuid()}"
+    root.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if root.is_symlink() or root.stat().st_uid != os.getuid():
+        raise PermissionError(f"{root} is not a folder of this user: remove it")
+    return root / hashlib.sha256(os.fsencode(state.resolve())).hexdigest()[:12]

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.robot import JOINTS, LEGS
 from runtime.messages import TICK_DTYPE
-from runtime.recorder import Recording
+from runtime.recording import Recording
 from station.ros_messages import definition, imu, joint_state, odometry, transforms, twist
 from station.session import StationError
 from station.ticks import check_fields

@@ -17,7 +17,8 @@ from pathlib import Path
 import rerun as rr
 
 from drivers.description import RobotDescription
-from runtime import config, recorder
+from runtime import config
+from runtime.recording import load
 from station.blueprint import build_blueprint
 from station.canvas import Canvas
 from station.session import Station, StationError
@@ -77,7 +78,7 @@ def view_recording(path: Path, screen: Screen) -> rr.RecordingStream:
     Raises:
         RecordingError, ConfigError, StationError: the file cannot be read, or another version wrote it.
     """
-    recording = recorder.load(path)
+    recording = load(path)
     check_fields(recording.ticks.dtype, str(path))
     description = config.parse(tomllib.loads(recording.header.robot_toml), f"{path}: robot").robot
     stream = screen.open(path.name)

@@ -21,7 +21,7 @@ from drivers.robot import Measurement
 from runtime.control.policy import encode_policy
 from runtime.link import LinkError
 from runtime.messages import Event, Mode, ModeReply, PolicyReply, RecordingReply, Request, Status
-from runtime.recorder import load
+from runtime.recording import load
 from runtime.state import AlreadyRunning, lock, state_folder
 from runtime.systemd import Notifier
 from station.session import Station

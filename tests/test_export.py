@@ -14,9 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scenes import rotation
 from walks import Walk
 
-from runtime import recorder
 from runtime.messages import TICK_DTYPE, Request
-from runtime.recorder import Recording
+from runtime.recording import Recording, load
 from station.export import column_names, export_csv, export_mcap, start_of, tick_definition
 from station.ros_messages import JOINT_NAMES, definition
 from station.session import StationError
@@ -31,7 +30,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     walk.stand()
     walk.ask(Request.WALK)
     walk.run(1.0, (0.4, 0.1, 0.3))
-    return recorder.load(walk.write())
+    return load(walk.write())
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.messages import TICK_DTYPE, Event
-from runtime.recorder import CHUNK, Header, Recorder, RecordingError, layout, list_recordings, load
+from runtime.recorder import CHUNK, Recorder
+from runtime.recording import Header, RecordingError, layout, list_recordings, load
 
 EVENT = Event(stamp=1.5, tick=3, kind="mode", text="DAMP -> STAND_UP: asked for")
 

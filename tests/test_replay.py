@@ -11,17 +11,16 @@ import pytest
 from daemons import Served, make_config
 from walks import Walk, walk_around
 
-from runtime import recorder
 from runtime.config import ROBOTS
 from runtime.control.policy import Policy, encode_policy
 from runtime.messages import CONTROL_DTYPE, Mode, Request
-from runtime.recorder import Recording
+from runtime.recording import Recording, load
 from runtime.replay import STAGES, ReplayError, compare_policy, replay
 
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return recorder.load(walk_around(tmp_path_factory.mktemp("recordings")).write())
+    return load(walk_around(tmp_path_factory.mktemp("recordings")).write())
 
 
 def changed(recording: Recording, **headers: object) -> Recording:
@@ -53,7 +52,7 @@ def test_a_ring_that_begins_in_the_middle_of_a_movement_replays_from_its_first_k
         walk.run(0.2)
         walk.ask(Request.WALK if mode is Mode.WALK else Request.SIT)
     walk.run(2.4, (0.4, 0.1, 0.3))
-    recording = recorder.load(walk.write())
+    recording = load(walk.write())
     assert recording.ticks["index"][0] > 1 and recording.ticks["mode"][0] == mode
     result = replay(recording)
     assert result.difference is None
@@ -93,7 +92,7 @@ def test_a_policy_that_came_in_the_middle_is_used_from_its_tick_on(tmp_path: Pat
     walk.policy = msgspec.structs.replace(walk.policy, name="weaker", shift_time_constant=0.1)
     walk.cycle.swap_policy(walk.policy)
     walk.run(0.5, (0.3, 0.0, 0.0))
-    recording = recorder.load(walk.write())
+    recording = load(walk.write())
     assert replay(recording).difference is None
     with pytest.raises(ReplayError, match="policy number 1"):
         replay(changed(recording, policies={}))
@@ -117,7 +116,7 @@ def test_lost_commands_replay_through_expiry_to_standing(tmp_path: Path) -> None
     walk.run(0.5, (0.4, 0.0, 0.0))
     walk.run(2.5)
     assert walk.cycle.state.mode is Mode.STAND
-    assert replay(recorder.load(walk.write())).difference is None
+    assert replay(load(walk.write())).difference is None
 
 
 def test_what_a_daemon_recorded_replays(tmp_path: Path) -> None:
@@ -133,7 +132,7 @@ def test_what_a_daemon_recorded_replays(tmp_path: Path) -> None:
             return served.daemon.flight.write("test")
 
     path = asyncio.run(play())
-    recording = recorder.load(path)
+    recording = load(path)
     quick = (ROBOTS / "stoch3.toml").read_text().replace('name = "stoch3"', f'name = "{recording.header.robot}"')
     quick += (
         "\n[posture]\nsoft_start = 0.05\nfold_time = 0.05\nrise_time = 0.05\nsettle_time = 0.01\nblend_time = 0.02\n"

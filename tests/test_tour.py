@@ -10,7 +10,7 @@ import pytest
 from daemons import Served, make_config
 
 from runtime.messages import Mode
-from runtime.recorder import load
+from runtime.recording import load
 from station import tour
 from station.session import Station
 from station.tour import Leg, Tour, TourReport, plan_tour

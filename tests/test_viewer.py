@@ -10,10 +10,9 @@ from hypothesis.extra.numpy import arrays
 from scenes import quaternion, robot, rotation
 from walks import Walk
 
-from runtime import recorder
 from runtime.control.kinematics import forward, leg_geometry
 from runtime.messages import TICK_DTYPE, tick_schema
-from runtime.recorder import RecordingError
+from runtime.recording import RecordingError, load
 from station import ticks as station_ticks
 from station.canvas import SCENE_HZ, Canvas
 from station.pose import heading_to_world, leg_points, orientation_xyzw
@@ -67,7 +66,7 @@ def test_a_recording_becomes_an_rrd_with_every_tick_in_the_charts(walked: Walk, 
     view_recording(path, Screen(save=tmp_path / "seen.rrd"))
     written = (tmp_path / "seen.rrd").read_bytes()
     assert written[:4] == b"RRF2"
-    assert len(written) > 100 * len(recorder.load(path).ticks)
+    assert len(written) > 100 * len(load(path).ticks)
 
 
 def test_charts_take_every_tick_and_the_scene_its_own_rate(walked: Walk) -> None:
@@ -80,7 +79,7 @@ def test_charts_take_every_tick_and_the_scene_its_own_rate(walked: Walk) -> None
         def log(self, *_: object, **__: object) -> None: ...
         def set_time(self, *_: object, **__: object) -> None: ...
 
-    ticks = recorder.load(walked.write("counted")).ticks
+    ticks = load(walked.write("counted")).ticks
     canvas = Canvas(Counting(), walked.config.robot)  # type: ignore[arg-type]
     for first in range(0, len(ticks), 7):
         canvas.draw(ticks[first : first + 7])

@@ -15,7 +15,8 @@ from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle, Wake
 from runtime.messages import Mode, Request
 from runtime.policies import find_policy, load
-from runtime.recorder import Header, Recorder, layout
+from runtime.recorder import Recorder
+from runtime.recording import Header, layout
 from sim.scenario import Scenario
 from sim.world import World
 
@@ -58,7 +59,7 @@ class Walk:
         if self.recorder.count % self.recorder.keyframe_every == 1:
             self.recorder.keep_keyframe(self.cycle.remember())
         while self.cycle.events:
-            self.recorder.events.append(self.cycle.events.popleft())
+            self.recorder.keep_event(self.cycle.events.popleft())
 
     def ask(self, *wishes: Request) -> None:
         """Requests between two ticks, each of which must be accepted."""

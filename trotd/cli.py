@@ -109,7 +109,7 @@ def run(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     with _one_line_errors():
         from runtime import daemon, policies
-        from runtime.state import state_folder
+        from runtime.state import memory_folder, state_folder
         from trotd.bodies import build_body
 
         config, path = _load(robot, rate_hz, listen)
@@ -120,7 +120,8 @@ def run(
 
             config = lenient(config)
         part = build_body(body, config, path, place, observe)
-        job = daemon.Job(config, path.read_text(), chosen, part.robot, place, part.channels, _say_ready)
+        memory = memory_folder(place)
+        job = daemon.Job(config, path.read_text(), chosen, part.robot, place, part.channels, _say_ready, memory)
         for written in daemon.main(job).flight.written:
             typer.echo(f"recording: {written}")
 

@@ -22,7 +22,7 @@ def refusals() -> Iterator[None]:
     """What the user can mend, as one line and exit code 1; Ctrl-C as 130."""
     from runtime.config import ConfigError
     from runtime.policies import PolicyError
-    from runtime.recorder import RecordingError
+    from runtime.recording import RecordingError
     from runtime.replay import ReplayError
     from station.session import StationError
 
@@ -203,12 +203,13 @@ def replay(
     """Run a recording through the core again: bit for bit the same, or the first tick and stage that differ."""
     import time
 
-    from runtime import policies, recorder
+    from runtime import policies
+    from runtime.recording import load
     from runtime.replay import Player, compare_policy
     from runtime.replay import replay as play
 
     with refusals():
-        loaded = recorder.load(recording)
+        loaded = load(recording)
         if policy is not None:
             other = compare_policy(loaded, policies.load(policy, loaded.header.robot))
             typer.echo(f"{other.ticks} walking ticks under {policy.name}, differences as root mean squares:")
@@ -239,7 +240,7 @@ def export(
     rrd: Annotated[Path | None, typer.Option("--rrd", help="For rerun.")] = None,
 ) -> None:
     """Write a recording as CSV, MCAP or RRD."""
-    from runtime import recorder
+    from runtime.recording import load
     from station.export import EXPORTS
     from station.session import StationError
 
@@ -247,7 +248,7 @@ def export(
         wanted = {kind: path for kind, path in (("csv", csv), ("mcap", mcap), ("rrd", rrd)) if path is not None}
         if not wanted:
             raise StationError("name at least one of --csv, --mcap, --rrd")
-        loaded = recorder.load(recording)
+        loaded = load(recording)
         for kind, path in wanted.items():
             EXPORTS[kind](loaded, path)
             typer.echo(f"{path}: {path.stat().st_size} bytes")

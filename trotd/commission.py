@@ -26,6 +26,7 @@ from drivers.commissioning import (
     mount_from_gravity,
     zeros_from_stops,
 )
+from drivers.durable import write_whole
 from drivers.robot import Array
 from drivers.wiring import MotorsConfig
 from runtime.config import Config
@@ -102,8 +103,7 @@ class Commission:
         return progress
 
     def _keep(self) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.write_bytes(msgspec.json.encode(self.progress))
+        write_whole(self.path, msgspec.json.encode(self.progress))
 
     def _find_joints(self) -> None:
         rows = self.progress.joints

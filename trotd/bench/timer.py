@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from runtime import config, recorder
+from runtime import config
+from runtime.recording import SUFFIX, load
 from station.session import NoAnswer, Station, StationError, connected
 from trotd.bench.report import Figure, Finding, Missing, shown
 
@@ -167,8 +168,8 @@ def _daemon(rate: float, fifo: bool, seconds: int) -> Iterator[tuple[Station, Ca
 
 
 def _read(folder: Path, rate: float) -> Slice:
-    (path,) = (folder / "recordings").rglob(f"*{recorder.SUFFIX}")
-    ticks = recorder.load(path).ticks
+    (path,) = (folder / "recordings").rglob(f"*{SUFFIX}")
+    ticks = load(path).ticks
     walking = ticks[ticks["mode"] == WALK]
     walking = walking[round(0.5 * rate) :]  # the first moments load what no tick after them loads
     missed = int(walking["overruns"][-1]) - int(walking["overruns"][0])
