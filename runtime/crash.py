@@ -16,8 +16,8 @@ import numpy as np
 from drivers.durable import write_whole
 from runtime.messages import Event
 from runtime.recorder import CHUNK, KEYFRAMES
-from runtime.recording import SUFFIX, Header, RecordingError, dtype_of, prune, save, stem
-from runtime.ring import RingError, Rows, open_left
+from runtime.recording import SUFFIX, Header, dtype_of, prune, save, stem
+from runtime.ring import Rows, open_left
 
 RING, HEADER = "ring", "header.json"
 LEFT = 3
@@ -76,28 +76,14 @@ def salvage(left: Path, recordings: Path, max_files: int, max_bytes: int) -> tup
         OSError: the disk refused; it is still there.
     """
     try:
-        run = msgspec.json.decode((left / HEADER).read_bytes(), type=Run)
-        ticks, keyframes, events = open_left(left / RING, 3)
-        layout = dtype_of(run.header, str(left))
-        if layout.itemsize != ticks.rows.dtype.itemsize:
-            raise CrashError(f"{left}: its ticks are not what its header says")
-    except (msgspec.MsgspecError, RingError, RecordingError) as error:
+        header, ended, ticks = _read(left)
+    except (ValueError, OverflowError, msgspec.MsgspecError) as error:
         shutil.rmtree(left)
         raise CrashError(f"{left}: {error}") from error
     places = ticks.whole()
     if not len(places):
         shutil.rmtree(left)
         return None, "it had not begun to tick"
-    rows = ticks.rows.view(layout)
-    first, last = rows[places[0]], rows[places[-1]]
-    ended = run.epoch + float(last["stamp"])
-    header = msgspec.structs.replace(
-        run.header,
-        reason="crash" if rows["armed"][places].any() else UNARMED,
-        written=time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(ended)),
-        events=list(_events(events)),
-        keyframes=[data for data in _rows(keyframes) if np.frombuffer(data, "<u8", 1)[0] >= first["index"]][:KEYFRAMES],
-    )
     path = recordings / f"{stem(ended, header.reason)}{SUFFIX}"
     idle = list(recordings.glob(f"*-{UNARMED.replace(' ', '-')}{SUFFIX}")) if header.reason == UNARMED else []
     save(path, header, (ticks.rows[part].tobytes() for part in np.array_split(places, 1 + len(places) // CHUNK)))
@@ -106,6 +92,28 @@ def salvage(left: Path, recordings: Path, max_files: int, max_bytes: int) -> tup
     prune(recordings, path, max_files, max_bytes)
     shutil.rmtree(left)
     return path, f"it ended without a word at {header.written}, {len(places)} ticks are kept"
+
+
+def _read(left: Path) -> tuple[Header, float, Rows]:
+    """Header, wall clock of the last tick, ticks as raw bytes."""
+    run = msgspec.json.decode((left / HEADER).read_bytes(), type=Run)
+    ticks, keyframes, events = open_left(left / RING, 3)
+    rows = ticks.rows.view(dtype_of(run.header, str(left)))
+    places = ticks.whole()
+    if rows.shape != ticks.rows.shape:
+        raise CrashError("its ticks are not what its header says")
+    if not len(places):
+        return run.header, run.epoch, ticks
+    ended = run.epoch + float(rows["stamp"][places[-1]])
+    known = [data for data in _rows(keyframes) if np.frombuffer(data, "<u8", 1)[0] >= rows["index"][places[0]]]
+    header = msgspec.structs.replace(
+        run.header,
+        reason="crash" if rows["armed"][places].any() else UNARMED,
+        written=time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(ended)),
+        events=list(_events(events)),
+        keyframes=known[:KEYFRAMES],
+    )
+    return header, ended, ticks
 
 
 def _rows(rows: Rows) -> Iterator[bytes]:

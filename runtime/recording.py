@@ -127,7 +127,7 @@ def load(path: Path) -> Recording:
             body = file.read()
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: header: {error}") from error
     return Recording(path, header, _records(path, header, body))
 

@@ -38,14 +38,17 @@ class Rows:
         """Shape (length,)."""
         self.count = 0
         """Rows put so far."""
+        self._size = dtype.itemsize
+        self._bytes, self._numbers = memory[8 * length :].data, self.sequence.data
 
     def put(self, row: Records) -> None:
         """Copy a row of shape (1,) over the oldest."""
-        place = self.count % len(self.rows)
-        self.sequence[place] = 0
-        self.rows[place] = row[0]
+        numbers, size = self._numbers, self._size
+        place = self.count % len(numbers)
+        numbers[place] = 0
+        self._bytes[place * size : (place + 1) * size] = row.tobytes()  # a structured assignment goes field by field
         self.count += 1
-        self.sequence[place] = self.count
+        numbers[place] = self.count
 
     def whole(self) -> np.ndarray:
         """Places of the newest rows that follow each other without a gap, oldest first."""

@@ -81,13 +81,19 @@ def is_damp(command: JointCommand) -> bool:
 class Served:
     """A daemon in this process and a client beside it; the client's calls run on a thread, as another process would."""
 
-    def __init__(self, made: Config, folder: Path, body: Any = None, channels: Any = lambda _keys: ()) -> None:
+    def __init__(
+        self,
+        made: Config,
+        folder: Path,
+        body: Any = None,
+        channels: Any = lambda _keys: (),
+        memory: Path | None = None,
+    ) -> None:
         self.config = made
         self.body = body or Probe(made)
         self.ready = asyncio.Event()
-        job = Job(
-            made, "# test", make_policy(made.robot.name), self.body, folder, channels, ready=lambda: self.ready.set()
-        )
+        policy = make_policy(made.robot.name)
+        job = Job(made, "# test", policy, self.body, folder, channels, lambda: self.ready.set(), memory)
         self.daemon = Daemon(job)
 
     async def __aenter__(self) -> Served:

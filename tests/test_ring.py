@@ -27,7 +27,7 @@ def test_what_was_whole_comes_back_in_order(tmp_path_factory: pytest.TempPathFac
     rows, words = create(KINDS, path)
     for number in range(count):
         rows.put(row(number))
-        words.put(np.array([b"word %d" % number]))
+        words.put(np.array([b"word %d" % number], KINDS[1].dtype))
     kept = min(count, 7)
     if moment != "between rows":
         place = count % 7
