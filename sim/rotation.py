@@ -59,20 +59,3 @@ def to_quaternion(rotation: Array) -> Array:
     )
     quaternion: Array = np.array(rows[largest]) / (2 * math.sqrt(squares[largest]))
     return quaternion if quaternion[0] >= 0 else -quaternion
-
-
-def turned(orientation: Array, rotation_vector: Array) -> Array:
-    """Quaternion w x y z turned by a rotation vector (3,) rad in its own frame. Shape (4,)."""
-    w, x, y, z = orientation
-    angle = float(np.linalg.norm(rotation_vector))
-    scale = 0.5 if angle < 1e-9 else math.sin(angle / 2) / angle
-    a, (b, c, d) = math.cos(angle / 2), scale * rotation_vector
-    product: Array = np.array(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )
-    return product / float(np.linalg.norm(product))

@@ -6,8 +6,8 @@ import numpy as np
 
 from drivers.description import JointLimits
 from drivers.robot import Array, ImuSample, JointState, Measurement
-from sim.rotation import turned
 from sim.scenario import Noise
+from sim.sensing import ERRORS, READINGS, disturb
 
 AMBIENT = 25.0
 """°C."""
@@ -23,7 +23,7 @@ class Sensors:
     """Noise, biases and motor temperatures of one episode."""
 
     def __init__(self, limits: JointLimits) -> None:
-        self._continuous = np.array(limits.continuous_torque)
+        self._square = np.tile(np.array(limits.continuous_torque) ** 2, (4, 1))
         self._no_fault = np.zeros((4, 3), dtype=np.int32)
         self._no_age = np.zeros((4, 3))
         for shared in (self._no_fault, self._no_age):
@@ -32,51 +32,40 @@ class Sensors:
 
     def reset(self, noise: Noise, seed: int) -> None:
         """Start an episode: cold motors, new biases drawn from ``seed``."""
-        self._noise = noise
         self._noisy = noise != Noise()
         self._random = np.random.default_rng(seed)
         self._temperature = np.full((4, 3), AMBIENT)
         draw = self._random.standard_normal
-        self._position_bias = noise.joint_position_bias * draw((4, 3))
-        self._torque_bias = noise.joint_torque_bias * draw((4, 3))
-        self._tilt_bias = noise.orientation_bias * draw(3)
-        self._rate_bias = noise.angular_velocity_bias * draw(3)
-        self._force_bias = noise.linear_acceleration_bias * draw(3)
+        self._bias = np.concatenate([
+            noise.joint_position_bias * draw(12), np.zeros(12), noise.joint_torque_bias * draw(12),
+            noise.orientation_bias * draw(3), noise.angular_velocity_bias * draw(3),
+            noise.linear_acceleration_bias * draw(3),
+        ])  # fmt: skip
+        white = (noise.joint_position, noise.joint_velocity, noise.joint_torque)
+        self._sigma = np.repeat(
+            [*white, noise.orientation, noise.angular_velocity, noise.linear_acceleration], [12, 12, 12, 3, 3, 3]
+        )
 
     def warm(self, mean_square_torque: Array, duration: float) -> None:
         """Carry ``mean_square_torque`` (4, 3) N²·m² for ``duration`` s: I²R heat against a first-order loss."""
-        target = AMBIENT + RISE * mean_square_torque / self._continuous**2
+        target = AMBIENT + RISE * mean_square_torque / self._square
         self._temperature = self._temperature + (target - self._temperature) * (duration / WARMING_TIME)
 
-    def read(
-        self,
-        stamp: float,
-        orientation: Array,
-        angular_velocity: Array,
-        specific_force: Array,
-        joints: tuple[Array, Array, Array],
-    ) -> Measurement:
+    def read(self, stamp: float, exact: Array) -> Measurement:
         """One sample of everything.
 
         Args:
             stamp: s.
-            orientation: wxyz, body to world. Shape (4,).
-            angular_velocity: rad/s in the body frame. Shape (3,).
-            specific_force: m/s² in the body frame. Shape (3,).
-            joints: position rad, velocity rad/s and torque N·m, each (4, 3).
+            exact: what sensors without error would read, as ``sensing.READINGS`` says. Shape (46,). Kept, not copied.
         """
-        position, velocity, torque = joints
+        read = exact
         if self._noisy:
-            noise, draw = self._noise, self._random.standard_normal
-            position = position + self._position_bias + noise.joint_position * draw((4, 3))
-            velocity = velocity + noise.joint_velocity * draw((4, 3))
-            torque = torque + self._torque_bias + noise.joint_torque * draw((4, 3))
-            orientation = turned(orientation, self._tilt_bias + noise.orientation * draw(3))
-            angular_velocity = angular_velocity + self._rate_bias + noise.angular_velocity * draw(3)
-            specific_force = specific_force + self._force_bias + noise.linear_acceleration * draw(3)
+            read = np.empty(READINGS)
+            disturb(exact, self._bias, self._sigma, self._random.standard_normal(ERRORS), read)
+        position, velocity, torque = read[:36].reshape(3, 4, 3)
         return Measurement(
             stamp=stamp,
-            imu=ImuSample(stamp, orientation, angular_velocity, specific_force),
+            imu=ImuSample(stamp, read[36:40], read[40:43], read[43:46]),
             joints=JointState(position, velocity, torque, self._temperature, self._no_fault, self._no_age),
             voltage=VOLTAGE,
         )

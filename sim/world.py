@@ -24,15 +24,12 @@ from sim.motors import Motors
 from sim.quiet import silenced
 from sim.rotation import from_rpy, from_xyzw, to_quaternion
 from sim.scenario import Push, Scenario
+from sim.sensing import BODY, GRAVITY, POSITION, RATE, READINGS, ROTATION, VELOCITY, read_body
 from sim.sensors import Sensors
 from sim.terrain import HeightField, Plane, Slope, Steps, Terrain, resting_height
-from sim.truth import Truth
+from sim.truth import Trunk, Truth
 from sim.urdf import read_model
 
-GRAVITY = 9.81
-"""m/s²."""
-UPWARDS = np.array([0.0, 0.0, GRAVITY])
-"""What an accelerometer at rest feels, world frame, m/s²."""
 FAR = 100.0
 """Height at which nothing touches anything, m."""
 JOINT_NAMES = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
@@ -110,7 +107,8 @@ class World:
         self._states: Sequence[Any] = self._bullet.getJointStates(
             self._robot, self._joints, physicsClientId=self._client
         )
-        self._velocity = np.array(scenario.velocity, dtype=float)
+        self._body = np.zeros(BODY)
+        self._body[VELOCITY] = scenario.velocity
         self._sensors.reset(scenario.noise, scenario.seed)
         self._measurement = self._sense()
         return self._measurement
@@ -128,13 +126,13 @@ class World:
         first = self._ticks * self.substeps
         self._motors.take(command, first)
         measurement = self._measurement
-        torques = []
+        torques: list[float] = []
         for index in range(first, first + self.substeps):
             self._physics_step(index)
-            torques.append(self._motors.torque)
+            torques += self._motors.torque
         self._ticks += 1
-        history = np.array(torques)
-        self._sensors.warm(((history * history).sum(axis=0) / self.substeps).reshape(4, 3), self.period)
+        history = np.array(torques).reshape(self.substeps, 4, 3)
+        self._sensors.warm(np.einsum("ijk,ijk->jk", history, history) / self.substeps, self.period)
         self._measurement = self._sense()
         return measurement
 
@@ -150,21 +148,27 @@ class World:
 
     def fallen(self, tilt: float = 1.0) -> bool:
         """Whether the body touches the ground or leans by more than ``tilt`` rad."""
-        if self._rotation[2, 2] < math.cos(tilt):
+        if self._body[11] < math.cos(tilt):
             return True
         return bool(self._bullet.getContactPoints(self._robot, linkIndexA=-1, physicsClientId=self._client))
+
+    @property
+    def trunk(self) -> Trunk:
+        """The trunk's exact state now: a part of ``truth`` that costs nothing."""
+        body = self._body
+        return Trunk(body[POSITION], body[ROTATION].reshape(3, 3), body[VELOCITY], body[RATE])
 
     @property
     def truth(self) -> Truth:
         """The exact state now."""
         contacts, forces = self._foot_forces()
-        position, velocity = self._joint_arrays()
-        torque = np.array(self._motors.torque).reshape(4, 3)
+        body = self._body
+        position, velocity, torque = self._exact[:36].reshape(3, 4, 3)
         return Truth(
-            self._position,
-            self._rotation,
-            self._velocity,
-            self._angular_velocity,
+            body[POSITION],
+            body[ROTATION].reshape(3, 3),
+            body[VELOCITY],
+            body[RATE],
             contacts,
             forces,
             position,
@@ -201,20 +205,16 @@ class World:
                 )
 
     def _sense(self) -> Measurement:
-        before = self._velocity
-        self._position, self._rotation = self._pose()
-        linear, angular = self._bullet.getBaseVelocity(self._robot, physicsClientId=self._client)
-        self._angular_velocity = np.array(angular)
-        self._velocity = np.array(linear) - _cross(angular, (self._rotation @ self._com).tolist())
-        world_to_body = self._rotation.T
-        position, velocity = self._joint_arrays()
-        return self._sensors.read(
-            self.time,
-            to_quaternion(self._rotation),
-            world_to_body @ self._angular_velocity,
-            world_to_body @ ((self._velocity - before) / self.period + UPWARDS),
-            (position, velocity, np.array(self._motors.torque).reshape(4, 3)),
-        )
+        bullet, states = self._bullet, self._states
+        position, orientation = bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._client)
+        linear, angular = bullet.getBaseVelocity(self._robot, physicsClientId=self._client)
+        raw = np.array([
+            *[state[0] for state in states], *[state[1] for state in states], *self._motors.torque,
+            *position, *orientation, *linear, *angular,
+        ])  # fmt: skip
+        before, self._body, self._exact = self._body[VELOCITY], np.empty(BODY), np.empty(READINGS)
+        read_body(raw, self._com, self._principal, before, self.period, self._body, self._exact)
+        return self._sensors.read(self.time, self._exact)
 
     def _pose(self) -> tuple[Array, Array]:
         """Body origin (3,) and rotation body to world (3, 3), from PyBullet's frame at the centre of mass."""
@@ -222,20 +222,19 @@ class World:
         rotation = from_xyzw(orientation) @ self._principal.T
         return np.array(position) - rotation @ self._com, rotation
 
-    def _joint_arrays(self) -> tuple[Array, Array]:
-        both = np.array([state[:2] for state in self._states])
-        return both[:, 0].reshape(4, 3).copy(), both[:, 1].reshape(4, 3).copy()
-
     def _foot_forces(self) -> tuple[NDArray[np.bool_], Array]:
-        contacts, forces = np.zeros(4, dtype=bool), np.zeros((4, 3))
+        contacts, forces = [False] * 4, [[0.0, 0.0, 0.0] for _ in range(4)]
         for contact in self._bullet.getContactPoints(self._robot, physicsClientId=self._client):
             leg = self._foot_of_link.get(contact[3])
             if leg is None or contact[9] <= 0.0:
                 continue
             contacts[leg] = True
-            forces[leg] += np.array(contact[7]) * contact[9]
-            forces[leg] += np.array(contact[11]) * contact[10] + np.array(contact[13]) * contact[12]
-        return contacts, forces
+            force = forces[leg]
+            for axis in range(3):
+                force[axis] += (
+                    contact[7][axis] * contact[9] + contact[11][axis] * contact[10] + contact[13][axis] * contact[12]
+                )
+        return np.array(contacts), np.array(forces)
 
     def _start(self, scenario: Scenario) -> None:
         """Put robot and ground where ``scenario`` wants them, with nothing of the last episode left.
@@ -361,10 +360,6 @@ class World:
                 raise PhysicsError(
                     f"link {name}: PyBullet turned its inertia into {inertia}; it breaks the triangle rule"
                 )
-
-
-def _cross(a: Sequence[float], b: Sequence[float]) -> Array:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def _import_bullet() -> Any:

@@ -346,13 +346,23 @@ def test_the_watchdog_is_fed_by_the_tick(tmp_path: Path, monkeypatch: pytest.Mon
     assert heard.count("WATCHDOG=1") >= 3
 
 
-def test_a_notifier_without_a_manager_says_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    Notifier().tell("READY=1")
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
-    notifier = Notifier()
-    notifier.tell("READY=1")
-    notifier.close()
+def test_a_notifier_speaks_to_its_manager_and_outlives_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = str(tmp_path / "manager")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(path)
+        manager.settimeout(5.0)
+        monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+        nobodys = Notifier()
+        nobodys.tell("READY=1")
+        monkeypatch.setenv("NOTIFY_SOCKET", path)
+        notifier = Notifier()
+        notifier.tell("WATCHDOG=1")
+        assert manager.recv(100) == b"WATCHDOG=1", "what was told without a manager went nowhere"
+    notifier.tell("WATCHDOG=1")
+    (tmp_path / "manager").unlink()
+    notifier.tell("STOPPING=1")
+    for one in (nobodys, notifier):
+        one.close()
 
 
 def test_the_state_folder(monkeypatch: pytest.MonkeyPatch) -> None:

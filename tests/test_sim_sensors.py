@@ -29,7 +29,7 @@ WHITE = {
 
 
 def read(sensors: Sensors) -> Measurement:
-    return sensors.read(0.25, *EXACT, JOINTS)
+    return sensors.read(0.25, np.concatenate([np.ravel(JOINTS), *EXACT]))
 
 
 def errors(measurement: Measurement) -> dict[str, np.ndarray]:

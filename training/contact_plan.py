@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 
-import numba
-
+from runtime.control.compilation import compiled
 from training.rigid_body import STATES, P, R, V, W
 
 
-@numba.njit(cache=True)
+@compiled
 def x_and_y(origin, yaw, com):  # type: ignore[no-untyped-def]
     """Centre of mass of a level body whose origin is at ``origin``."""
     c, s = math.cos(yaw), math.sin(yaw)
     return origin[0] + c * com[0] - s * com[1], origin[1] + s * com[0] + c * com[1]
 
 
-@numba.njit(cache=True)
+@compiled
 def plan_path(position, yaw, command, com, dt, path, here, expected):  # type: ignore[no-untyped-def]
     """Fill ``path`` (steps, 12) with a level body that follows ``command`` (steps, 3) = vx, vy, yaw rate from here.
 
@@ -44,7 +43,7 @@ def plan_path(position, yaw, command, com, dt, path, here, expected):  # type: i
         path[k, W + 2] = rate
 
 
-@numba.njit(cache=True)
+@compiled
 def foothold(position, yaw, command, touchdown, after, foot):  # type: ignore[no-untyped-def]
     """Point (3,) on level ground where a foot lands ``after`` s from now, into ``foot``.
 
@@ -59,7 +58,7 @@ def foothold(position, yaw, command, touchdown, after, foot):  # type: ignore[no
     foot[2] = 0.0
 
 
-@numba.njit(cache=True)
+@compiled
 def plan_contacts(  # type: ignore[no-untyped-def]
     p, clock, stance_now, feet_now, touchdown, position, yaw, command, dt, feet, stance
 ):

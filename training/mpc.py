@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import daqp
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.robot import Array
+from runtime.control.compilation import compiled
 from training.rigid_body import GRAVITY, STATES, P, R, RigidBody, V, W, rotation_from_rpy
 
 HORIZON = 6
@@ -161,7 +161,7 @@ def _solve_by_name(problem: Problem, solver: str) -> Array:
     return np.asarray(solution, dtype=np.float64)
 
 
-@numba.njit(cache=True)
+@compiled
 def input_matrix(feet, position, yaw, mass, inertia, dt):  # type: ignore[no-untyped-def]
     """B_k (12, 12): what the forces of a step do to the state; level body at ``yaw``, zero-order hold."""
     rotation = np.empty((3, 3))
@@ -184,7 +184,7 @@ def input_matrix(feet, position, yaw, mass, inertia, dt):  # type: ignore[no-unt
     return b
 
 
-@numba.njit(cache=True)
+@compiled
 def drift(x, yaw, dt):  # type: ignore[no-untyped-def]
     """A_k x in place, for the columns of ``x`` (12, any): p += dt ṗ, θ += dt Rz(yaw)ᵀ ω."""
     c, s = math.cos(yaw), math.sin(yaw)
@@ -196,14 +196,14 @@ def drift(x, yaw, dt):  # type: ignore[no-untyped-def]
         x[R + 2, j] += dt * x[W + 2, j]
 
 
-@numba.njit(cache=True)
+@compiled
 def _fall(x, dt):  # type: ignore[no-untyped-def]
     """Add c, gravity's part of a step, to the column ``x`` (12, 1)."""
     x[P + 2, 0] -= 0.5 * dt * dt * GRAVITY
     x[V + 2, 0] -= dt * GRAVITY
 
 
-@numba.njit(cache=True)
+@compiled
 def _pyramid(rows, lower, upper, first_row, first_bound, variable, friction):  # type: ignore[no-untyped-def]
     """|f_x|, |f_y| ≤ μ f_z as four rows about the force at ``variable``."""
     row = first_row
@@ -216,7 +216,7 @@ def _pyramid(rows, lower, upper, first_row, first_bound, variable, friction):  #
             row += 1
 
 
-@numba.njit(cache=True)
+@compiled
 def _condense(  # type: ignore[no-untyped-def]
     state, reference, expected, feet, stance, mass, inertia, dt, weight, force_weight, friction, min_force, max_force
 ):
@@ -257,7 +257,7 @@ def _condense(  # type: ignore[no-untyped-def]
     return hessian, gradient, rows, lower, upper
 
 
-@numba.njit(cache=True)
+@compiled
 def _spread(  # type: ignore[no-untyped-def]
     state, reference, expected, feet, stance, mass, inertia, dt, weight, force_weight, friction, min_force, max_force
 ):

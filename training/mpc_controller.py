@@ -6,12 +6,12 @@ robot, and with the fixed terms on (``mpc-tuned``) it is the honest opponent.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from drivers.robot import Array, JointCommand, Measurement
 from runtime.config import Config
 from runtime.control.command import wrapped
+from runtime.control.compilation import compiled
 from runtime.control.controller import Controller
 from runtime.control.kinematics import jacobian_of_leg
 from runtime.control.records import Records, SolverStatus, VelocityCommand
@@ -130,7 +130,7 @@ def centre_state(rpy: Array, height: float, twist: Array, com: Array) -> Array:
     return state
 
 
-@numba.njit(cache=True)
+@compiled
 def put_forces(geometry, q, rpy, forces, torque):  # type: ignore[no-untyped-def]
     """Feed-forward -Jᵀ f (4, 3) N·m of forces in the heading frame into ``torque``. Paper Eq. 6."""
     rotation, jacobian = np.empty((3, 3)), np.empty((3, 3))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.robot import Array
+from runtime.control.compilation import compiled
 
 TABLE_TERMS = ("position", "velocity", "orientation", "angular_velocity", "grf")
 """Table I, row by row."""
@@ -47,7 +47,7 @@ def gaussian_kernel(weight: float, sharpness: float, x: Array, y: Array) -> floa
     return float(weight * np.exp(-sharpness * np.sum((np.asarray(x) - np.asarray(y)) ** 2)))
 
 
-@numba.njit(cache=True)
+@compiled
 def fill_features(position, velocity, rotation, angular_velocity, grf, weight, features):  # type: ignore[no-untyped-def]
     """Write a tick's state and forces (4, 3) N into ``features`` (30,).
 
@@ -64,7 +64,7 @@ def fill_features(position, velocity, rotation, angular_velocity, grf, weight, f
             features[18 + 3 * leg + i] = grf[leg, i] / weight
 
 
-@numba.njit(cache=True)
+@compiled
 def table_terms(table, reference, features, terms):  # type: ignore[no-untyped-def]
     """Fill ``terms`` (5,) from the reference's features (30,) and the robot's (30,). Paper Table I."""
     for term in range(5):
@@ -109,7 +109,7 @@ class TaskReward:
         return np.array([getattr(self, name) for name in self.__slots__])
 
 
-@numba.njit(cache=True)
+@compiled
 def task_terms(  # type: ignore[no-untyped-def]
     table, dt, smoothed, command, velocity, rpy, height_error, angular_velocity, torque, slip, terms
 ):

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from drivers.description import RobotDescription, composite_inertia
 from drivers.robot import Array
+from runtime.control.compilation import compiled
 
 GRAVITY = 9.81
 STATES = 12
@@ -39,7 +39,7 @@ def rigid_body(description: RobotDescription, joint_position: Array) -> RigidBod
     return RigidBody(mass=description.mass, inertia=inertia, com=com)
 
 
-@numba.njit(cache=True)
+@compiled
 def rotation_from_rpy(rpy, rotation):  # type: ignore[no-untyped-def]
     """Rotation body to world, Rz(yaw) Ry(pitch) Rx(roll), written into ``rotation`` (3, 3)."""
     sr, cr = math.sin(rpy[0]), math.cos(rpy[0])
@@ -50,7 +50,7 @@ def rotation_from_rpy(rpy, rotation):  # type: ignore[no-untyped-def]
     rotation[2, 0], rotation[2, 1], rotation[2, 2] = -sp, cp * sr, cp * cr
 
 
-@numba.njit(cache=True)
+@compiled
 def rpy_rates(rpy, angular_velocity, rates):  # type: ignore[no-untyped-def]
     """Derivative of roll, pitch, yaw from the angular velocity in the world, exact, into ``rates`` (3,)."""
     sy, cy = math.sin(rpy[2]), math.cos(rpy[2])
@@ -61,7 +61,7 @@ def rpy_rates(rpy, angular_velocity, rates):  # type: ignore[no-untyped-def]
     rates[2] = angular_velocity[2] + forward * tp
 
 
-@numba.njit(cache=True)
+@compiled
 def advance(state, forces, feet, mass, inertia, dt):  # type: ignore[no-untyped-def]
     """Integrate the non-linear rigid body by ``dt`` in place; ``forces``, ``feet`` (4, 3) in the world."""
     rotation = np.empty((3, 3))

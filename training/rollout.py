@@ -124,7 +124,7 @@ class Stage:
     def __init__(self, setup: Setup) -> None:
         control = setup.config.control
         self.setup = setup
-        self._world = World(setup.config.robot, control.rate_hz, control.gait.walking_height, setup.physics_rate_hz)
+        self.world = World(setup.config.robot, control.rate_hz, control.gait.walking_height, setup.physics_rate_hz)
         self._controller = Controller(setup.config.robot, control, setup.policy)
         self._lowest = LOWEST * control.gait.walking_height
         self._weight = setup.config.robot.mass * 9.81
@@ -139,7 +139,7 @@ class Stage:
 
     def close(self) -> None:
         """Release the simulator."""
-        self._world.close()
+        self.world.close()
 
     def _commands(self, conditions: Conditions) -> Array:
         if conditions.command is not None:
@@ -152,23 +152,23 @@ class Stage:
         features = self.setup.features
         assert features is not None, "Table I compares with a reference"
         table, sums = reward.table(), np.zeros(len(TABLE_TERMS))
-        world, record, lowest = self._world, self._controller.record, self._lowest
+        world, record, lowest = self.world, self._controller.record, self._lowest
         ground, start_yaw = task.conditions.scenario.terrain, task.conditions.scenario.rpy[2]
 
         def watch(tick: int, _: Array) -> bool:
-            truth = world.truth
+            trunk = world.trunk
             score_table(
-                table, features[tick], start_yaw, truth.position, truth.linear_velocity, truth.rotation_body_to_world,
-                truth.angular_velocity, record["grf"][0], self._weight, sums,
+                table, features[tick], start_yaw, trunk.position, trunk.linear_velocity, trunk.rotation_body_to_world,
+                trunk.angular_velocity, record["grf"][0], self._weight, sums,
             )  # fmt: skip
-            x, y, z = truth.position.tolist()
+            x, y, z = trunk.position.tolist()
             return bool(z - ground.height_at(x, y) > lowest)
 
         return self._play(task, watch, TABLE_TERMS, sums)
 
     def _serve(self, task: Task, reward: TaskReward) -> Episode:
         table, sums, smoothed = reward.table(), np.zeros(len(TASK_TERMS)), np.zeros(3)
-        world, geometry = self._world, self._controller.geometry
+        world, geometry = self.world, self._controller.geometry
         dt, height = world.period, self.setup.config.control.gait.walking_height
         ground = task.conditions.scenario.terrain
 
@@ -186,5 +186,5 @@ class Stage:
         return self._play(task, watch, TASK_TERMS, sums)
 
     def _play(self, task: Task, watch: Watch, names: tuple[str, ...], sums: Array) -> Episode:
-        steps, fell = walk(self._world, self._controller, task.conditions, self._commands(task.conditions), watch)
+        steps, fell = walk(self.world, self._controller, task.conditions, self._commands(task.conditions), watch)
         return Episode(float(sums.sum()), steps, fell, named(names, sums))

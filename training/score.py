@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from runtime.control.compilation import compiled
 from runtime.control.kinematics import foot_of_leg, jacobian_of_leg
 from training.reward import FEATURES, fill_features, table_terms, task_terms
 
 
-@numba.njit(cache=True)
+@compiled
 def score_table(table, reference, start_yaw, position, velocity, rotation, rate, grf, weight, sums):  # type: ignore[no-untyped-def]
     """Add a tick's Table I terms to ``sums`` (5,). ``grf`` (4, 3) N are the forces that the controller asked for.
 
@@ -26,7 +26,7 @@ def score_table(table, reference, start_yaw, position, velocity, rotation, rate,
         sums[i] += terms[i]
 
 
-@numba.njit(cache=True)
+@compiled
 def score_task(  # type: ignore[no-untyped-def]
     table, dt, smoothed, command, height_error, velocity, rotation, rate, q, speed, torque, contacts, geometry, sums
 ):
@@ -43,7 +43,7 @@ def score_task(  # type: ignore[no-untyped-def]
         sums[i] += terms[i]
 
 
-@numba.njit(cache=True)
+@compiled
 def slip_speed(geometry, velocity, rotation, rate, q, speed, contacts):  # type: ignore[no-untyped-def]
     """Summed horizontal speed of the feet that touch the ground, m/s."""
     foot, jacobian = np.empty(3), np.empty((3, 3))

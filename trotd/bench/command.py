@@ -17,6 +17,7 @@ class Section(StrEnum):
     TIMER = "timer"
     SIM = "sim"
     MEMORY = "memory"
+    TRAINING = "training"
 
 
 MODULES = {Section.SIM: "simulation"}

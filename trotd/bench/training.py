@@ -1,0 +1,123 @@
+"""A training tick against the physics steps and PyBullet calls that it contains: what all else costs.
+
+An episode is played, the engine's calls are written down, then the same calls are made once more with nothing around
+them: the same torques from the same start, so the same physics.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trotd.bench.report import Figure, Finding, shown
+
+if TYPE_CHECKING:
+    from training.rollout import Stage, Task
+
+Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+TICKS = 400
+BOUND = 1.4
+
+
+class Listening:
+    """The engine's module, with every function call that goes through it written down."""
+
+    def __init__(self, engine: Any) -> None:
+        self.calls: list[Call] = []
+        self._engine = engine
+
+    def __getattr__(self, name: str) -> Any:
+        """A constant as it is, a function with a pen in its hand."""
+        target = getattr(self._engine, name)
+        if not callable(target):
+            return target
+
+        def noted(*args: Any, **kwargs: Any) -> Any:
+            self.calls.append((target, args, kwargs))
+            return target(*args, **kwargs)
+
+        return noted
+
+
+def measure(quick: bool) -> Iterator[Finding]:
+    """Both rewards, whole episodes and their bare calls in turns."""
+    rounds = 6 if quick else 30
+    for reward in ("table", "task"):
+        whole, bare, steps = _compare(reward, rounds)
+        name = f"{reward} reward"
+        yield Figure("training", f"{name}: a tick", 1e6 * whole, "µs")
+        yield Figure("training", f"{name}: its physics steps and calls alone", 1e6 * bare, "µs")
+        yield Figure("training", f"{name}: its physics steps alone", 1e6 * steps, "µs")
+        yield Figure("training", f"{name}: tick over bare calls", whole / bare, "x", BOUND)
+
+
+def _compare(reward: str, rounds: int) -> tuple[float, float, float]:
+    """Medians of s a tick: whole, bare calls, bare physics steps."""
+    from runtime import config
+    from runtime.control.policy import balance_policy
+    from sim.scenario import Scenario
+    from training.randomize import SENSORS, Conditions
+    from training.reference import make_reference
+    from training.reward import TableReward, TaskReward
+    from training.rollout import Setup, Stage, Task
+
+    known = config.load(config.find_robot("stoch3"))
+    policy = balance_policy(known.robot, known.control.gait.walking_height)
+    features, commands = make_reference(known).resampled(known.control.rate_hz, TICKS)
+    wanted = None if reward == "table" else (0.5, 0.0, 0.0)
+    setup = Setup(
+        known,
+        policy,
+        TableReward() if reward == "table" else TaskReward(),
+        TICKS,
+        features,
+        commands,
+        physics_rate_hz=600.0,
+    )
+    stage = Stage(setup)
+    task = Task(policy.parameters, Conditions(Scenario(noise=SENSORS), wanted))
+    calls = _listen(stage, task)
+    times = [(_play(stage, task), _replay(calls), _time_steps(calls)) for _ in shown(range(rounds), reward, rounds)]
+    stage.close()
+    whole, bare, steps = np.median(times, axis=0) / TICKS
+    return float(whole), float(bare), float(steps)
+
+
+def _play(stage: Stage, task: Task) -> float:
+    began = time.perf_counter()
+    episode = stage.rollout(task)
+    taken = time.perf_counter() - began
+    if episode.steps < TICKS:
+        raise RuntimeError(f"the hand-built matrix fell after {episode.steps} ticks")
+    return taken
+
+
+def _listen(stage: Stage, task: Task) -> list[Call]:
+    """Every call of an episode, its reset too; the first episode only compiles."""
+    _play(stage, task)
+    world: Any = stage.world
+    engine, world._bullet = world._bullet, Listening(world._bullet)
+    _play(stage, task)
+    calls: list[Call] = world._bullet.calls
+    world._bullet = engine
+    return calls
+
+
+def _replay(calls: list[Call]) -> float:
+    began = time.perf_counter()
+    for function, args, kwargs in calls:
+        function(*args, **kwargs)
+    return time.perf_counter() - began
+
+
+def _time_steps(calls: list[Call]) -> float:
+    total = 0.0
+    for function, args, kwargs in calls:
+        began = time.perf_counter()
+        function(*args, **kwargs)
+        if function.__name__ == "stepSimulation":
+            total += time.perf_counter() - began
+    return total
