@@ -15,6 +15,7 @@ import numpy as np
 
 from drivers.description import JointLimits
 from drivers.robot import JointCommand
+from sim.sensing import motor_law
 
 STICKING_SPEED = 0.1
 """Dry friction grows linearly up to this joint speed, rad/s: a hard sign would chatter, and a constraint in the physics
@@ -86,9 +87,8 @@ class Motors:
 
 
 def _law(command: JointCommand) -> _Law:
-    with np.errstate(invalid="ignore", over="ignore"):
-        constant = command.torque + command.kp * command.position + command.kd * command.velocity
-    if not (np.isfinite(constant).all() and np.isfinite(command.kp).all() and np.isfinite(command.kd).all()):
+    law = np.empty((3, 12))
+    if not motor_law(command.position, command.velocity, command.kp, command.kd, command.torque, law):
         names = [item.name for item in fields(command) if not np.isfinite(getattr(command, item.name)).all()]
         raise ValueError(f"joint command {', '.join(names) or 'torque'}: not finite")
-    return _Law(constant.ravel().tolist(), command.kp.ravel().tolist(), command.kd.ravel().tolist())
+    return _Law(*law.tolist())

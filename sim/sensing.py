@@ -116,3 +116,37 @@ def _turn(orientation, a, b, c, d, out):  # type: ignore[no-untyped-def]
     norm = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
     for k in range(4):
         out[k] /= norm
+
+
+@numba.njit(cache=True, error_model="numpy")
+def motor_law(position, velocity, kp, kd, torque, law):  # type: ignore[no-untyped-def]
+    """A command (five (4, 3)) as the motors run it: torque = constant - kp q - kd q̇, into ``law`` (3, 12).
+
+    Returns whether it is finite.
+    """
+    total = 0.0
+    for leg in range(4):
+        for joint in range(3):
+            i = 3 * leg + joint
+            p, d = kp[leg, joint], kd[leg, joint]
+            law[0, i] = torque[leg, joint] + p * position[leg, joint] + d * velocity[leg, joint]
+            law[1, i], law[2, i] = p, d
+            total += 0.0 * (law[0, i] + p + d)
+    return total == 0.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def warm_motors(torque, temperature, square, ambient, rise, share):  # type: ignore[no-untyped-def]
+    """Temperatures (4, 3) °C after a tick in which the motors exerted ``torque`` (n, 12) N·m in its n physics steps.
+
+    ``square`` (4, 3) is the continuous torque squared, ``share`` of the way that a tick goes to the end value.
+    """
+    warmer = np.empty((4, 3))
+    for leg in range(4):
+        for joint in range(3):
+            mean = 0.0
+            for k in range(torque.shape[0]):
+                mean += torque[k, 3 * leg + joint] ** 2
+            end = ambient + rise * mean / (torque.shape[0] * square[leg, joint])
+            warmer[leg, joint] = temperature[leg, joint] + (end - temperature[leg, joint]) * share
+    return warmer

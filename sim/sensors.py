@@ -7,7 +7,7 @@ import numpy as np
 from drivers.description import JointLimits
 from drivers.robot import Array, ImuSample, JointState, Measurement
 from sim.scenario import Noise
-from sim.sensing import ERRORS, READINGS, disturb
+from sim.sensing import ERRORS, READINGS, disturb, warm_motors
 
 AMBIENT = 25.0
 """°C."""
@@ -46,10 +46,10 @@ class Sensors:
             [*white, noise.orientation, noise.angular_velocity, noise.linear_acceleration], [12, 12, 12, 3, 3, 3]
         )
 
-    def warm(self, mean_square_torque: Array, duration: float) -> None:
-        """Carry ``mean_square_torque`` (4, 3) N²·m² for ``duration`` s: I²R heat against a first-order loss."""
-        target = AMBIENT + RISE * mean_square_torque / self._square
-        self._temperature = self._temperature + (target - self._temperature) * (duration / WARMING_TIME)
+    def warm(self, torque: Array, duration: float) -> None:
+        """Carry ``torque`` (n, 12) N·m in n equal parts of ``duration`` s: I²R heat against a first-order loss."""
+        share = duration / WARMING_TIME
+        self._temperature = warm_motors(torque, self._temperature, self._square, AMBIENT, RISE, share)
 
     def read(self, stamp: float, exact: Array) -> Measurement:
         """One sample of everything.

@@ -131,8 +131,7 @@ class World:
             self._physics_step(index)
             torques += self._motors.torque
         self._ticks += 1
-        history = np.array(torques).reshape(self.substeps, 4, 3)
-        self._sensors.warm(np.einsum("ijk,ijk->jk", history, history) / self.substeps, self.period)
+        self._sensors.warm(np.array(torques).reshape(self.substeps, 12), self.period)
         self._measurement = self._sense()
         return measurement
 
@@ -163,7 +162,7 @@ class World:
         """The exact state now."""
         contacts, forces = self._foot_forces()
         body = self._body
-        position, velocity, torque = self._exact[:36].reshape(3, 4, 3)
+        position, velocity, torque = self.joints
         return Truth(
             body[POSITION],
             body[ROTATION].reshape(3, 3),
@@ -175,6 +174,22 @@ class World:
             velocity,
             torque,
         )
+
+    @property
+    def foot_contacts(self) -> NDArray[np.bool_]:
+        """Feet that touched the ground in the last physics step: a part of ``truth`` that costs less. Shape (4,)."""
+        touched = [False] * 4
+        for contact in self._bullet.getContactPoints(self._robot, physicsClientId=self._client):
+            leg = self._foot_of_link.get(contact[3])
+            if leg is not None and contact[9] > 0.0:
+                touched[leg] = True
+        return np.array(touched)
+
+    @property
+    def joints(self) -> tuple[Array, Array, Array]:
+        """Exact joint positions rad, velocities rad/s and motor torques N·m now: a part of ``truth``. Each (4, 3)."""
+        position, velocity, torque = self._exact[:36].reshape(3, 4, 3)
+        return position, velocity, torque
 
     def close(self) -> None:
         """Release the simulator. Harmless when repeated."""

@@ -14,7 +14,8 @@ from drivers.description import SIDE, RobotDescription, composite_inertia
 from runtime.config import ROBOTS, load
 from sim import model as model_module
 from sim.model import build_model, standing_pose
-from sim.rotation import about_axis, from_rpy, from_xyzw, to_quaternion, to_rpy, turned
+from sim.rotation import about_axis, from_rpy, from_xyzw, to_quaternion, to_rpy
+from sim.sensing import ERRORS, READINGS, disturb
 
 STOCH3 = load(ROBOTS / "stoch3.toml").robot
 MODEL = build_model(STOCH3)
@@ -125,7 +126,10 @@ def test_turning_a_quaternion_turns_in_its_own_frame(
 ) -> None:
     rotation = about_axis(axis / np.linalg.norm(axis), angle)
     about = about / np.linalg.norm(about)
-    w, x, y, z = turned(to_quaternion(rotation), amount * about)
+    exact, bias, read = np.zeros(READINGS), np.zeros(ERRORS), np.zeros(READINGS)
+    exact[36:40], bias[36:39] = to_quaternion(rotation), amount * about
+    disturb(exact, bias, np.zeros(ERRORS), np.zeros(ERRORS), read)
+    w, x, y, z = read[36:40]
     np.testing.assert_allclose(from_xyzw((x, y, z, w)), rotation @ about_axis(about, amount), atol=1e-12)
 
 

@@ -92,10 +92,10 @@ def test_the_same_seed_reads_the_same_bits() -> None:
 
 def test_motors_warm_to_their_rated_rise_and_cool_again() -> None:
     sensors = Sensors(LIMITS)
-    rated = np.tile(np.array(LIMITS.continuous_torque) ** 2, (4, 1))
+    rated = np.tile(np.array(LIMITS.continuous_torque), (2, 4))
     seen = []
-    for torque_squared in [rated] * 2000 + [0 * rated] * 2000:
-        sensors.warm(torque_squared, WARMING_TIME / 200)
+    for torque in [rated] * 2000 + [0 * rated] * 2000:
+        sensors.warm(torque, WARMING_TIME / 200)
         seen.append(read(sensors).joints.temperature)
     temperature = np.array(seen)
     assert (np.diff(temperature[:1000], axis=0) > 0).all()

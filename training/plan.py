@@ -66,11 +66,11 @@ IMITATE = StagePlan(
 )  # fmt: skip
 """From nothing to a walk."""
 SERVE = StagePlan(
-    name="serve", reward="task", iterations=30, directions=48, ticks=520, conditions="task", symmetry="both",
-    stdev=0.05, stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.003, fall_weight=2.5,
+    name="serve", reward="task", iterations=40, directions=48, ticks=520, conditions="task", symmetry="both",
+    stdev=0.05, stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.01, fall_weight=2.5,
 )  # fmt: skip
 """From a walk to one that follows commands and takes pushes."""
-POLISH = msgspec.structs.replace(SERVE, name="polish", iterations=60, learning_rate_end=0.004)
+POLISH = msgspec.structs.replace(SERVE, name="polish", iterations=70, learning_rate=0.015, learning_rate_end=0.002)
 REFINE = msgspec.structs.replace(
     SERVE, name="refine", iterations=60, stdev=0.03, learning_rate=0.01, learning_rate_end=0.001
 )

@@ -173,13 +173,12 @@ class Stage:
         ground = task.conditions.scenario.terrain
 
         def watch(_: int, command: Array) -> bool:
-            truth = world.truth
-            x, y, z = truth.position.tolist()
+            trunk, joints = world.trunk, world.joints
+            x, y, z = trunk.position.tolist()
             above = z - ground.height_at(x, y)
             score_task(
-                table, dt, smoothed, command, above - height,
-                truth.linear_velocity, truth.rotation_body_to_world, truth.angular_velocity, truth.joint_position,
-                truth.joint_velocity, truth.joint_torque, truth.foot_contacts, geometry, sums,
+                table, dt, smoothed, command, above - height, trunk.linear_velocity, trunk.rotation_body_to_world,
+                trunk.angular_velocity, *joints, world.foot_contacts, geometry, sums,
             )  # fmt: skip
             return bool(above > self._lowest)
 

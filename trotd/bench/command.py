@@ -33,9 +33,11 @@ def measure(section: Section, quick: bool) -> Iterator[Finding]:
 
 
 def bench(sections: Sequence[Section], quick: bool, json: bool) -> bool:
-    """Measure ``sections`` and print what was found. Returns whether every bound was met."""
+    """Measure ``sections`` and print what was found, even if one breaks. Returns whether every bound was met."""
     findings: list[Finding] = []
-    for section in sections:
-        findings += measure(section, quick)
-    (print_json if json else print_table)(findings)
+    try:
+        for section in sections:
+            findings.extend(measure(section, quick))
+    finally:
+        (print_json if json else print_table)(findings)
     return all(finding.met is not False for finding in findings if isinstance(finding, Figure))

@@ -54,6 +54,10 @@ class Slice:
     ticks: int
 
 
+class Disturbed(RuntimeError):
+    """A slice that says nothing about the loop; the message says what happened in it."""
+
+
 def measure(quick: bool) -> Iterator[Finding]:
     """Every rate under normal scheduling and SCHED_FIFO, then with and without somebody listening."""
     slices, seconds = (2, 5) if quick else (12, 5)
@@ -66,7 +70,10 @@ def measure(quick: bool) -> Iterator[Finding]:
             return
         for rate in rates:
             yield from beside_cyclictest(rate, fifo, slices, seconds)
-    yield from listened_to(1000.0, 2 * slices)
+    try:
+        yield from listened_to(1000.0, 2 * slices)
+    except Disturbed as error:
+        yield Missing("timer", "a subscriber on or off", str(error))
 
 
 def beside_cyclictest(rate: float, fifo: bool, slices: int, seconds: int) -> Iterator[Finding]:
@@ -79,9 +86,15 @@ def beside_cyclictest(rate: float, fifo: bool, slices: int, seconds: int) -> Ite
     theirs: list[np.ndarray] = []
     name = f"{rate:g} Hz, {'FIFO' if fifo else 'normal'}"
     for _ in shown(range(slices), name, slices):
-        ours.append(run_daemon(rate, fifo, seconds))
+        try:
+            ours.append(run_daemon(rate, fifo, seconds))
+        except Disturbed as error:
+            yield Missing("timer", name, f"a slice is left out: {error}")
+            continue
         if shutil.which("cyclictest"):
             theirs.append(run_cyclictest(rate, fifo, CYCLICTEST))
+    if not ours:
+        return
     p50, p99 = _percentiles([one.lateness for one in ours])
     yield Figure("timer", f"{name}: lateness p50", p50, "µs")
     yield Figure("timer", f"{name}: lateness p99", p99, "µs")
@@ -93,7 +106,7 @@ def beside_cyclictest(rate: float, fifo: bool, slices: int, seconds: int) -> Ite
     note = f"cyclictest {floor50:.0f} and {floor99:.0f} µs"
     yield Figure("timer", f"{name}: p50 over cyclictest's", p50 / floor50, "x", None if fifo else 1.0)
     yield Figure("timer", f"{name}: p99 over cyclictest's", p99 / floor99, "x", 4.0 if fifo else 2.0, note=note)
-    floor = 100.0 * sum(_wakes_missed(wakes, rate) for wakes in theirs) / (rate * CYCLICTEST * slices)
+    floor = 100.0 * sum(_wakes_missed(wakes, rate) for wakes in theirs) / (rate * CYCLICTEST * len(theirs))
     note = f"ours {missed:.3f} %, cyclictest's {floor:.3f} %"
     yield Figure("timer", f"{name}: ticks missed beyond cyclictest's", max(0.0, missed - floor), "%", 0.3, note=note)
 
@@ -168,8 +181,12 @@ def _daemon(rate: float, fifo: bool, seconds: int) -> Iterator[tuple[Station, Ca
 
 
 def _read(folder: Path, rate: float) -> Slice:
-    (path,) = (folder / "recordings").rglob(f"*{SUFFIX}")
-    ticks = load(path).ticks
+    path = max((folder / "recordings").rglob(f"*{SUFFIX}"))
+    recording = load(path)
+    faults = [event.text for event in recording.header.events if event.kind == "fault"]
+    if faults:
+        raise Disturbed(f"the daemon damped: {faults[0]}")
+    ticks = recording.ticks
     walking = ticks[ticks["mode"] == WALK]
     walking = walking[round(0.5 * rate) :]  # the first moments load what no tick after them loads
     missed = int(walking["overruns"][-1]) - int(walking["overruns"][0])
