@@ -18,6 +18,7 @@ class Section(StrEnum):
     SIM = "sim"
     MEMORY = "memory"
     TRAINING = "training"
+    REPLAY = "replay"
 
 
 MODULES = {Section.SIM: "simulation"}
