@@ -6,7 +6,7 @@ Plain floats in lists: at twelve joints they cost a third of numpy, and the phys
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from math import copysign
 from typing import Any
@@ -20,6 +20,10 @@ from sim.sensing import motor_law
 STICKING_SPEED = 0.1
 """Dry friction grows linearly up to this joint speed, rad/s: a hard sign would chatter, and a constraint in the physics
 engine would cost as much as the rest of the step."""
+
+
+Encoder = Callable[[float, float], tuple[float, float]]
+"""From a joint's position rad and velocity rad/s to what its servo reads instead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +44,12 @@ class Motors:
     def __init__(self, limits: JointLimits) -> None:
         self._limits = limits
         self._friction = limits.friction_torque
+        self.peak: list[float] = []
+        """Knob: torque that each joint's motor reaches, N·m; 0 where none arrives at the joint."""
+        self.encoders: dict[int, Encoder] = {}
+        """Knob: joints (0 to 11) whose servo misreads its shaft: its own loop and its reports believe this."""
+        self.reversed: set[int] = set()
+        """Knob: joints whose motor turns the other way than it is asked."""
         self.reset(1.0, 0)
 
     def reset(self, strength: float, delay: int) -> None:
@@ -49,7 +59,8 @@ class Motors:
             strength: share of the peak torque that the motors reach.
             delay: physics steps between a command's arrival and its effect.
         """
-        self._peak = [strength * peak for peak in self._limits.peak_torque] * 4
+        self.peak = [strength * peak for peak in self._limits.peak_torque] * 4
+        self.encoders, self.reversed = {}, set()
         self._delay = delay
         self._law = _LIMP
         self._pending: deque[tuple[int, _Law]] = deque()
@@ -74,16 +85,36 @@ class Motors:
         while self._pending and self._pending[0][0] <= step:
             self._law = self._pending.popleft()[1]
         law = self._law
+        read = self.read(states) if self.encoders else states
         self.torque = [
             torque if -peak < (torque := c - p * state[0] - d * state[1]) < peak else copysign(peak, torque)
-            for state, c, p, d, peak in zip(states, law.constant, law.kp, law.kd, self._peak, strict=True)
+            for state, c, p, d, peak in zip(read, law.constant, law.kp, law.kd, self.peak, strict=True)
         ]
+        for joint in self.reversed:
+            self.torque[joint] = -self.torque[joint]
         friction, bound = self._friction, STICKING_SPEED
         slope = friction / bound
         return [
             torque - (speed * slope if -bound < (speed := state[1]) < bound else copysign(friction, speed))
             for torque, state in zip(self.torque, states, strict=True)
         ]
+
+    @property
+    def misreads(self) -> bool:
+        """Whether any servo believes or reports what is not so."""
+        return bool(self.encoders or self.reversed)
+
+    def read(self, states: Sequence[Any]) -> list[tuple[float, float]]:
+        """Position rad and velocity rad/s of each joint as its servo knows them."""
+        encoders = self.encoders
+        return [
+            encoders[joint](state[0], state[1]) if joint in encoders else (state[0], state[1])
+            for joint, state in enumerate(states)
+        ]
+
+    def reported(self) -> list[float]:
+        """Torque of each joint as its servo reports it, N·m."""
+        return [-torque if joint in self.reversed else torque for joint, torque in enumerate(self.torque)]
 
 
 def _law(command: JointCommand) -> _Law:

@@ -70,7 +70,9 @@ class World:
         self._dt = self.period / self.substeps
         self._stand = standing_pose(description, walking_height)
         self._model = build_model(description) if description.urdf is None else read_model(description, urdf_search)
-        self._motors = Motors(description.joints)
+        self.motors = Motors(description.joints)
+        """The servos, with their knobs."""
+        self._jammed: set[int] = set()
         self._sensors = Sensors(description.joints)
         self._urdf = self._model.urdf()
         self._built: Terrain | None = None
@@ -103,7 +105,7 @@ class World:
         self._start(scenario)
         self._ticks = 0
         self._pushes = list(scenario.pushes)
-        self._motors.reset(scenario.motor_strength, round(scenario.extra_delay / self._dt))
+        self.motors.reset(scenario.motor_strength, round(scenario.extra_delay / self._dt))
         self._states: Sequence[Any] = self._bullet.getJointStates(
             self._robot, self._joints, physicsClientId=self._client
         )
@@ -124,12 +126,12 @@ class World:
             ValueError: a number in ``command`` is not finite.
         """
         first = self._ticks * self.substeps
-        self._motors.take(command, first)
+        self.motors.take(command, first)
         measurement = self._measurement
         torques: list[float] = []
         for index in range(first, first + self.substeps):
             self._physics_step(index)
-            torques += self._motors.torque
+            torques += self.motors.torque
         self._ticks += 1
         self._sensors.warm(np.array(torques).reshape(self.substeps, 12), self.period)
         self._measurement = self._sense()
@@ -144,6 +146,11 @@ class World:
         now = self.time
         self._pushes = [push for push in self._pushes if push.start + push.duration > now]
         self._pushes.append(Push(now, duration, force))
+
+    def jam(self, joint: int, torque: float) -> None:
+        """From now until the reset, joint ``joint`` (0 to 11) only turns under more than ``torque``, N·m."""
+        self._jammed.add(joint)
+        self._brake(joint, torque)
 
     def fallen(self, tilt: float = 1.0) -> bool:
         """Whether the body touches the ground or leans by more than ``tilt`` rad."""
@@ -200,7 +207,7 @@ class World:
     def _physics_step(self, index: int) -> None:
         """Run the motors' law on the present joint states, then the physics."""
         bullet, robot, client = self._bullet, self._robot, self._client
-        torque = self._motors.drive(index, self._states)
+        torque = self.motors.drive(index, self._states)
         bullet.setJointMotorControlArray(
             robot, self._joints, bullet.TORQUE_CONTROL, forces=torque, physicsClientId=client
         )
@@ -224,12 +231,19 @@ class World:
         position, orientation = bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._client)
         linear, angular = bullet.getBaseVelocity(self._robot, physicsClientId=self._client)
         raw = np.array([
-            *[state[0] for state in states], *[state[1] for state in states], *self._motors.torque,
+            *[state[0] for state in states], *[state[1] for state in states], *self.motors.torque,
             *position, *orientation, *linear, *angular,
         ])  # fmt: skip
         before, self._body, self._exact = self._body[VELOCITY], np.empty(BODY), np.empty(READINGS)
         read_body(raw, self._com, self._principal, before, self.period, self._body, self._exact)
-        return self._sensors.read(self.time, self._exact)
+        return self._sensors.read(self.time, self._misread(self._exact) if self.motors.misreads else self._exact)
+
+    def _misread(self, exact: Array) -> Array:
+        """What the servos believe of their joints, and the truth of the rest."""
+        read = exact.copy()
+        read[:24] = np.array(self.motors.read(self._states)).T.ravel()
+        read[24:36] = self.motors.reported()
+        return read
 
     def _pose(self) -> tuple[Array, Array]:
         """Body origin (3,) and rotation body to world (3, 3), from PyBullet's frame at the centre of mass."""
@@ -251,6 +265,17 @@ class World:
                 )
         return np.array(contacts), np.array(forces)
 
+    def _brake(self, joint: int, torque: float) -> None:
+        bullet = self._bullet
+        bullet.setJointMotorControl2(
+            self._robot,
+            self._joints[joint],
+            bullet.VELOCITY_CONTROL,
+            targetVelocity=0.0,
+            force=torque,
+            physicsClientId=self._client,
+        )
+
     def _start(self, scenario: Scenario) -> None:
         """Put robot and ground where ``scenario`` wants them, with nothing of the last episode left.
 
@@ -260,6 +285,9 @@ class World:
         bullet, client = self._bullet, self._client
         if scenario.terrain != self._built or not isinstance(scenario.terrain, Plane | Slope):
             self._build(scenario.terrain)
+        for joint in self._jammed:
+            self._brake(joint, 0.0)
+        self._jammed.clear()
         self._place(np.array([0.0, 0.0, FAR]), np.eye(3), np.zeros(3), self._stand)
         bullet.stepSimulation(physicsClientId=client)
         for body in self._ground:

@@ -74,6 +74,8 @@ def plan(memory, record, linear, yaw_rate, standing):  # type: ignore[no-untyped
     follow(p, policy, s, t, linear, yaw_rate, standing)
     observe(p, policy, s, t)
     act(p, policy, s, t)
+    if not np.isfinite(t.asked.sum() + t.grf.sum()):  # before the bounds make a number of it
+        return -1
     advance_gait(p, s, t, standing)
     aim_feet(p, g, policy, s, t)
     aim_wrench(p, policy, t)

@@ -1,0 +1,119 @@
+"""The fault matrix from a shell: ``python tests/torture.py --help``."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")
+
+import typer
+from faults.matrix import BY_NAME, ROWS
+from faults.report import print_json, print_outcome, print_table, shown, worst
+from faults.run import BODIES, GAITS, Case, replay, run_trunk, trunks
+from faults.watch import Outcome
+
+FAILED, BAD_INPUT = 1, 2
+WIRE_SHARE = 0.4
+"""Seeds on the twin for each one on the simulator: it is five times slower."""
+
+
+def work(portions: Any, results: Any) -> None:
+    """A worker: one robot after another until there are none left."""
+    for portion in iter(portions.get, None):
+        run_trunk(portion, results.put)
+    results.put(None)
+
+
+def run(cases: Sequence[Case], jobs: int) -> list[Outcome]:
+    """All ``cases``, in worker processes of their own."""
+    context = multiprocessing.get_context("spawn")
+    portions, results = context.Queue(), context.Queue()
+    for portion in trunks(cases):
+        portions.put(portion)
+    workers = [context.Process(target=work, args=(portions, results), daemon=True) for _ in range(jobs)]
+    for worker in workers:
+        portions.put(None)
+        worker.start()
+    try:
+        return list(shown(_collected(results, jobs), "faults", len(cases)))
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.join()
+
+
+def _collected(results: Any, jobs: int) -> Any:
+    while jobs:
+        outcome = results.get()
+        if outcome is None:
+            jobs -= 1
+        else:
+            yield outcome
+
+
+def plan(rows: Sequence[str], seeds: int, first: int, bodies: Sequence[str]) -> list[Case]:
+    """Every row on every body that has it, standing and walking."""
+    return [
+        Case(body, gait, row.name, first + seed)
+        for row in ROWS
+        if row.name in rows
+        for body in bodies
+        if (row.sim if body == "sim" else row.wire) is not None
+        for gait in GAITS
+        for seed in range(seeds if body == "sim" else max(1, round(seeds * WIRE_SHARE)))
+    ]
+
+
+def main(
+    row: Annotated[list[str] | None, typer.Option(help="A row; may be given again. All if not given.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Replay this one seed and say all of it.")] = None,
+    seeds: Annotated[int, typer.Option(help="Seeds of each row and gait; the wire twin has 0.4 times as many.")] = 63,
+    first: Annotated[int, typer.Option(help="The first seed.")] = 0,
+    sample: Annotated[int | None, typer.Option(help="Only so many faults, spread over the whole matrix.")] = None,
+    body: Annotated[str | None, typer.Option(help="sim or wire; both if not given.")] = None,
+    gait: Annotated[str | None, typer.Option(help="stand or walk, with --seed; both if not given.")] = None,
+    jobs: Annotated[int, typer.Option(help="Worker processes.")] = os.cpu_count() or 1,
+    json: Annotated[bool, typer.Option("--json", help="Every fault as JSON.")] = False,
+    keep: Annotated[Path | None, typer.Option(help="Write the worst of every row to this file, as JSON.")] = None,
+) -> None:
+    """Break a simulated robot in every way of the fault matrix, standing and walking, and hold what happens to its bounds.
+
+    Exit code 1 if any was violated; each violation is printed with the command that shows it again.
+    """
+    for name in row or ():
+        if name not in BY_NAME:
+            typer.echo(f"row {name!r}: not in the matrix; there are {', '.join(BY_NAME)}", err=True)
+            raise typer.Exit(BAD_INPUT)
+    bodies = [body] if body else list(BODIES)
+    if seed is not None:
+        bodies = [b for b in bodies if all((BY_NAME[n].sim if b == "sim" else BY_NAME[n].wire) for n in row or BY_NAME)]
+        outcomes = [
+            replay(Case(b, g, name, seed))
+            for name in row or BY_NAME
+            for b in bodies
+            for g in ([gait] if gait else GAITS)
+        ]
+        for outcome in outcomes:
+            print_outcome(outcome)
+    else:
+        cases = plan(row or list(BY_NAME), seeds, first, bodies)
+        if sample is not None:
+            cases = cases[:: max(1, len(cases) // sample)][:sample]
+        order = {case: place for place, case in enumerate(cases)}
+        outcomes = sorted(run(cases, jobs), key=lambda o: order[Case(o.body, o.gait, o.row, o.seed)])
+        (print_json if json else print_table)(outcomes)
+    if keep is not None:
+        keep.write_bytes(worst(outcomes))
+    if any(outcome.violations for outcome in outcomes):
+        raise typer.Exit(FAILED)
+
+
+if __name__ == "__main__":
+    typer.run(main)
+    sys.exit(0)
