@@ -1,4 +1,5 @@
 # make run: the robot walks a tour in the simulator.   make run-wire: the same over the real drivers.   make test: the suite.   make check: lint, types, contracts.
+# make torture: the whole fault matrix; make torture ARGS="--row NAME --seed N": one fault again.
 # make bench: what the numbers in docs/performance.md come from.
 # Each creates the environment it needs in .venv; PYTHON names the interpreter to make it with.
 
@@ -8,7 +9,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run run-wire test test-service check bench format clean
+.PHONY: run run-wire test test-service check torture bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
@@ -21,6 +22,9 @@ test: $(VENV)/.dev
 
 test-service: $(VENV)/.dev
 	tests/service.sh
+
+torture: $(VENV)/.dev
+	@$(BIN)/python tests/torture.py $(ARGS)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -73,8 +73,7 @@ def plan(memory, record, linear, yaw_rate, standing):  # type: ignore[no-untyped
         return -1
     follow(p, policy, s, t, linear, yaw_rate, standing)
     observe(p, policy, s, t)
-    act(p, policy, s, t)
-    if not np.isfinite(t.asked.sum() + t.grf.sum()):  # before the bounds make a number of it
+    if not act(p, policy, s, t):
         return -1
     advance_gait(p, s, t, standing)
     aim_feet(p, g, policy, s, t)

@@ -118,7 +118,8 @@ def set_parameters(record: Records, policy: Policy, parameters: Array) -> None:
 def act(p, policy, s, t):  # type: ignore[no-untyped-def]
     """Fill ``asked`` and ``action`` (18,) from the observation; a direct policy's forces go into ``grf`` (4, 3).
 
-    Bounds are the tighter of the policy's own and the robot's; the shifts are low-passed before theirs.
+    Bounds are the tighter of the policy's own and the robot's; the shifts are low-passed before theirs. Returns whether
+    all that was asked is finite: a bound would make a number of what is none.
     """
     actions = 24 if policy.direct else 18
     out = np.zeros(24)
@@ -141,15 +142,18 @@ def act(p, policy, s, t):  # type: ignore[no-untyped-def]
         for i in range(2):
             out[3 * leg + i] += policy.capture_point * (t.twist[i] - t.velocity_command[i])
     t.asked[:] = out[:18]
+    if not np.isfinite(out.sum()):
+        return False
     _bound_shifts(p, policy, s, t)
     if policy.direct:
         _bound_forces(p, policy, t, out)
-        return
+        return True
     for i in range(6):
         bound = min(policy.action_bound[12 + i], p.wrench_bound[i])
         t.action[12 + i] = min(bound, max(-bound, out[12 + i]))
         if t.action[12 + i] != out[12 + i]:
             t.clamps |= _WRENCH
+    return True
 
 
 @compiled

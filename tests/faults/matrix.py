@@ -104,10 +104,6 @@ def silence(servo: Any) -> None:
     servo.silent = True
 
 
-def stick(servo: Any) -> None:
-    servo.stuck_encoder = True
-
-
 def knock(draw: Draw) -> Push:
     side = float(draw.choice([-1.0, 1.0]))
     return Push((within(draw, -200, 200), side * within(draw, 500, 900), 0.0), 0.2)
@@ -175,12 +171,12 @@ ROWS: tuple[Row, ...] = (
     Row(
         "encoder_stuck",
         lambda d: StuckEncoder(joint(d)),
-        lambda d: wire.Servos((joint(d),), stick, "stuck encoder "),
+        lambda d: StuckEncoder(joint(d)),
         seconds=2.0,
     ),
     Row("encoder_jumping", lambda d: JumpingEncoder(joint(d), within(d, -1.0, 1.0), within(d, 0.01, 1.0), seed(d))),
     Row("encoder_noisy", lambda d: NoisyEncoder(joint(d), within(d, 0.001, 0.1), within(d, 0.1, 10.0), seed(d))),
-    Row("sign_reversed", lambda d: ReversedSign(joint(d)), lambda d: wire.ReversedServo(joint(d))),
+    Row("sign_reversed", lambda d: ReversedSign(joint(d)), lambda d: ReversedSign(joint(d))),
     Row("torque_lost", lambda d: WeakMotors((joint(d),), 0.0), seconds=2.0),
     Row("torque_saturated", lambda d: WeakMotors((joint(d),), within(d, 0.05, 0.6)), seconds=2.0),
     Row("joint_jammed", lambda d: JammedJoint(joint(d), within(d, 5.0, 200.0)), seconds=2.0),

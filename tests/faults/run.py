@@ -20,7 +20,7 @@ from zlib import crc32
 import msgspec
 import numpy as np
 
-from faults.matrix import BY_NAME, Row
+from faults.matrix import BY_NAME
 from faults.rig import Fault, Rig
 from faults.watch import Outcome, Watch
 
@@ -32,6 +32,8 @@ WINDOW = 160
 """Ticks among which the one of the injection is drawn: two cycles of the gait."""
 REST = 1.5
 """s that a damped robot is watched on its way to the ground."""
+BRIEF, BRIEF_REST = 0.8, 0.2
+"""The same in a brief case: of the fault, and of the damped robot, s."""
 PATIENCE = 120.0
 """s that one fault may take before it is called hung."""
 
@@ -44,6 +46,8 @@ class Case:
     gait: str
     row: str
     seed: int
+    brief: bool = False
+    """Watched for no longer than it takes to see the robot's answer."""
 
     @property
     def base(self) -> int:
@@ -99,7 +103,7 @@ def suffer(rig: Rig, case: Case, dice: np.random.Generator) -> Outcome:
     outcome = Outcome(row=case.row, gait=case.gait, seed=case.seed, body=case.body, fault=repr(fault), violations=[])
     mode, watch = rig.mode, Watch(rig, outcome)
     try:
-        _live(rig, watch, row, fault)
+        _live(rig, watch, fault, *((BRIEF, BRIEF_REST) if case.brief else (row.seconds, REST)))
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         watch.violate(f"{type(error).__name__} in {place.name}: {error}")
@@ -111,15 +115,15 @@ def suffer(rig: Rig, case: Case, dice: np.random.Generator) -> Outcome:
     return outcome
 
 
-def _live(rig: Rig, watch: Watch, row: Row, fault: Fault) -> None:
+def _live(rig: Rig, watch: Watch, fault: Fault, seconds: float, after: float) -> None:
     rig.inject(fault)
-    end = rig.index + round(row.seconds / rig.period)
-    rest = round(REST / rig.period)
-    while rig.index < end and not watch.over:
+    limit, rest = round(seconds / rig.period), round(after / rig.period)
+    while watch.ticks < limit and not watch.over:
+        before = watch.outcome.answered
         rig.tick()
         watch.look()
-        if watch.outcome.answered is not None and watch.ticks - watch.outcome.answered > rest:
-            break
+        if before is None and watch.outcome.answered is not None:
+            limit = watch.ticks + rest
 
 
 def _forked(rig: Rig, case: Case, dice: np.random.Generator) -> Outcome:

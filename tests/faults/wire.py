@@ -52,14 +52,6 @@ class BusOff(Fault):
         rig.walk.twin.wire.faults.unplugged.update(self.buses)
 
 
-@dataclass
-class ReversedServo(Fault):
-    joint: int
-
-    def start(self, rig: Rig) -> None:
-        rig.walk.twin._angle.flat[self.joint] *= -1.0
-
-
 class Wires:
     """What lies between the driver and ``answer``: both ways may lose frames, replies may be late or spoilt."""
 
