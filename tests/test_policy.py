@@ -98,6 +98,18 @@ def test_the_tighter_bound_of_policy_and_robot_holds(tighter: str) -> None:
     assert bench.t.clamps == Clamp.SHIFT | Clamp.WRENCH
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", [0, 5, 12, 17])
+def test_what_is_asked_and_is_no_number_is_told_and_never_bounded_into_one(value: float, place: int) -> None:
+    bench = Workbench(chosen=linear(), bounds=WIDE)
+    bench.t.observation = OBSERVATION
+    assert act(bench.p, bench.chosen, bench.s, bench.t)
+    before = bench.t.action.copy()
+    bench.chosen["matrix"][3, place] = value
+    assert not act(bench.p, bench.chosen, bench.s, bench.t)
+    np.testing.assert_array_equal(bench.t.action, before)
+
+
 def test_shifts_follow_with_their_time_constant_and_do_not_wind_up() -> None:
     chosen = linear(shift_time_constant=0.05)
     bench = Workbench(chosen=chosen, bounds={**WIDE, "shift": 0.5})

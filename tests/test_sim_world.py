@@ -502,3 +502,43 @@ def test_an_impossible_push_is_refused_by_name(
 
 def test_the_payload_is_a_link_of_its_own(world: World) -> None:
     assert f'link name="{PAYLOAD}"' in world.model.urdf()
+
+
+def test_a_servo_that_misreads_believes_and_tells_it_and_the_truth_stays(world: World) -> None:
+    command = hold(world.reset(Scenario()).joints.position)
+    for _ in range(200):
+        world.step(command)
+    world.motors.encoders[4] = lambda q, v: (q + 0.05, 2.0 * v)
+    for _ in range(200):
+        measured = world.step(command)
+    truth = world.truth
+    misread = measured.joints.position - truth.joint_position
+    assert misread.flat[4] == pytest.approx(0.05, abs=5e-3)
+    assert np.abs(np.delete(misread.ravel(), 4)).max() < 5e-3
+    assert abs(truth.joint_position.flat[4] - command.position.flat[4]) > 0.02, "its loop acts on what it reads"
+
+
+def test_a_reversed_motor_drives_the_wrong_way_and_tells_the_right_one(world: World) -> None:
+    world.reset(FLIGHT)
+    world.motors.reversed.add(2)
+    push = replace(LIMP, torque=np.full((4, 3), 1.0))
+    for _ in range(3):
+        measured = world.step(push)
+    assert measured.joints.torque == pytest.approx(np.ones((4, 3)))
+    assert world.truth.joint_torque.flat[2] == pytest.approx(-1.0)
+    assert world.truth.joint_velocity.flat[2] < 0 < world.truth.joint_velocity.flat[5]
+
+
+def test_a_jammed_joint_holds_up_to_its_torque_until_the_reset(world: World) -> None:
+    push = replace(LIMP, torque=np.full((4, 3), 10.0))
+    for jam, moved in ((100.0, False), (1.0, True)):
+        start = world.reset(FLIGHT).joints.position.flat[2]
+        world.jam(2, jam)
+        for _ in range(6):
+            world.step(push)
+        assert bool(abs(world.truth.joint_position.flat[2] - start) > 0.01) is moved
+    world.reset(FLIGHT)
+    for _ in range(6):
+        world.step(push)
+    free = world.truth.joint_position
+    assert free.flat[2] == pytest.approx(free.flat[5], abs=0.05)

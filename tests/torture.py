@@ -9,9 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(_threads, "1")
-
 import typer
 from faults.matrix import BY_NAME, ROWS
 from faults.report import print_json, print_outcome, print_table, shown, worst
@@ -94,7 +91,7 @@ def main(
     json: Annotated[bool, typer.Option("--json", help="Every fault as JSON.")] = False,
     keep: Annotated[Path | None, typer.Option(help="Write the worst of every row to this file, as JSON.")] = None,
 ) -> None:
-    """Break a simulated robot in every way of the fault matrix, standing and walking, and hold what happens to its bounds.
+    """Break a simulated robot in every way of the fault matrix, standing and walking; hold what happens to its bounds.
 
     Exit code 1 if any was violated; each violation is printed with the command that shows it again.
     """

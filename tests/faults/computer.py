@@ -166,9 +166,7 @@ class Infeasible(Fault):
     def start(self, rig: Rig) -> None:
         controller = rig.cycle.controller
         controller.parameters["min_force"] = 2.0 * controller.parameters["max_force"]
-        controller.problems = [
-            problem._replace(min_force=2.0 * problem.max_force) for problem in controller.problems
-        ]
+        controller.problems = [problem._replace(min_force=2.0 * problem.max_force) for problem in controller.problems]
 
 
 @dataclass

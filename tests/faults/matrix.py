@@ -12,6 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from drivers.moteus_registers import FAULTS
+from drivers.motors import NOT_STARTING, RESTARTED
 from faults import wire
 from faults.computer import (
     ClockStep,
@@ -44,8 +46,6 @@ from faults.motors import (
     WeakMotors,
 )
 from faults.rig import Fault
-from drivers.moteus_registers import FAULTS
-from drivers.motors import NOT_STARTING, RESTARTED
 
 Draw = np.random.Generator
 CODES = (*FAULTS, RESTARTED, NOT_STARTING, 0, 11, 12, 15)

@@ -20,7 +20,6 @@ def changed(measurement: Measurement, **joints: np.ndarray) -> Measurement:
     return replace(measurement, joints=replace(measurement.joints, **joints))
 
 
-
 @dataclass
 class FrameLoss(Fault):
     """A share of the frames of some motors is lost, commands and replies alike; what drivers and servos make of it."""

@@ -59,7 +59,7 @@ def broken(measurement: Measurement, config: Config) -> str:
     numbers += [imu.orientation, imu.angular_velocity, imu.linear_acceleration, np.array([measurement.voltage])]
     if not all(np.isfinite(part).all() for part in numbers):
         return "not finite"
-    w, x, y, z = imu.orientation / np.linalg.norm(imu.orientation)
+    _, x, y, _ = imu.orientation / np.linalg.norm(imu.orientation)
     for what, wrong in (
         ("motor fault", joints.fault.any()),
         ("motor age", joints.age.max() > limits.max_age),

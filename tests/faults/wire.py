@@ -86,7 +86,11 @@ class Wires:
         if not self._happens(self.spoilt):
             return frame
         place = int(self.random.integers(len(data)))
-        return bus, identifier, data[:place] + bytes([data[place] ^ 1 << int(self.random.integers(8))]) + data[place + 1 :]
+        return (
+            bus,
+            identifier,
+            data[:place] + bytes([data[place] ^ 1 << int(self.random.integers(8))]) + data[place + 1 :],
+        )
 
     def _happens(self, share: float) -> bool:
         return share > 0.0 and self.random.random() < share
@@ -151,7 +155,11 @@ class Spoil:
 
     def __call__(self, felt: Felt, count: int) -> Felt:
         parts = [part.copy() for part in felt]
-        part, place = next((part, place) for part, place in zip(parts, (self.place, self.place - 4, self.place - 7), strict=True) if place < len(part))
+        part, place = next(
+            (part, place)
+            for part, place in zip(parts, (self.place, self.place - 4, self.place - 7), strict=True)
+            if place < len(part)
+        )
         part[place] = self.value
         return parts[0], parts[1], parts[2]
 
