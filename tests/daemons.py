@@ -6,7 +6,11 @@ import asyncio
 import itertools
 import os
 import socket
-from collections.abc import Callable
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +25,7 @@ from runtime.control.posture import Posture
 from runtime.cycle import Wake
 from runtime.daemon import Daemon, Job
 from runtime.messages import Mode, ModeReply, Request
-from station.session import Station, connected
+from station.session import Station, StationError, connected
 
 _numbers = itertools.count()
 QUICK = {
@@ -141,3 +145,33 @@ class Served:
 def wake(index: int, rate_hz: float = 200.0) -> Wake:
     """The tick at ``index`` periods, on time."""
     return Wake(index, index / rate_hz, 1.0 / rate_hz, 0.0, 0)
+
+
+@contextmanager
+def running(folder: Path, robot: Path, body: str) -> Iterator[tuple[subprocess.Popen[str], Station]]:
+    """A daemon in a process of its own, all that it leaves below ``folder``, and a client of it."""
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "trotd.cli", "run", "--body", body, "--robot", str(robot)]
+    command += ["--listen", endpoint, "--state", str(folder)]
+    environment = os.environ | {"RUNTIME_DIRECTORY": str(folder / "run")}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        with _reached(process, robot.stem, endpoint) as station:
+            yield process, station
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@contextmanager
+def _reached(process: subprocess.Popen[str], robot: str, endpoint: str) -> Iterator[Station]:
+    end = time.monotonic() + 60.0
+    while True:
+        try:
+            with connected(robot, endpoint) as station:
+                station.next_status()
+                yield station
+                return
+        except StationError:
+            assert process.poll() is None and time.monotonic() < end, "the daemon does not come up"
+            time.sleep(0.1)

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from daemons import QUICK, free_endpoint
+from daemons import QUICK, running
 from hypothesis import given
 from hypothesis import strategies as st
 from walks import Walk
@@ -25,7 +20,6 @@ from runtime.messages import Event, Mode, ModeReply, Request
 from runtime.recorder import EVENT_DTYPE, EVENTS, Recorder, event_row
 from runtime.recording import SUFFIX, list_recordings, load
 from runtime.replay import replay
-from station.session import Station, StationError, connected
 
 
 def left_by(walk: Walk, memory: Path) -> None:
@@ -161,35 +155,6 @@ def test_more_events_than_there_is_room_for(tmp_path: Path) -> None:
 # A daemon of its own --------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def running(folder: Path, robot: Path) -> Iterator[tuple[subprocess.Popen[str], Station]]:
-    endpoint = free_endpoint()
-    command = [sys.executable, "-m", "trotd.cli", "run", "--body", "null", "--robot", str(robot)]
-    command += ["--listen", endpoint, "--state", str(folder)]
-    environment = os.environ | {"RUNTIME_DIRECTORY": str(folder / "run")}
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
-    try:
-        with _reached(process, robot.stem, endpoint) as station:
-            yield process, station
-    finally:
-        process.kill()
-        process.communicate()
-
-
-@contextmanager
-def _reached(process: subprocess.Popen[str], robot: str, endpoint: str) -> Iterator[Station]:
-    end = time.monotonic() + 60.0
-    while True:
-        try:
-            with connected(robot, endpoint) as station:
-                station.next_status()
-                yield station
-                return
-        except StationError:
-            assert process.poll() is None and time.monotonic() < end, "the daemon does not come up"
-            time.sleep(0.1)
-
-
 def _robot(folder: Path) -> Path:
     """Stoch3 that stands up quickly."""
     text = (ROBOTS / "stoch3.toml").read_text()
@@ -202,7 +167,7 @@ def _robot(folder: Path) -> Path:
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_walk_that_is_killed_is_there_at_the_next_start(tmp_path: Path, number: signal.Signals) -> None:
     robot = _robot(tmp_path)
-    with running(tmp_path, robot) as (process, station):
+    with running(tmp_path, robot, "null") as (process, station):
         for wish, mode in ((Request.ARM, "DAMP"), (Request.STAND, "STAND"), (Request.WALK, "WALK")):
             assert station.ask_for(ModeReply, station.keys.mode, wish.value.encode()).accepted
             while station.next_status().mode != mode:
@@ -214,7 +179,7 @@ def test_a_walk_that_is_killed_is_there_at_the_next_start(tmp_path: Path, number
         process.send_signal(number)
         process.wait()
     assert seen.mode == "WALK" and not list_recordings(tmp_path / "recordings" / "stoch3")
-    with running(tmp_path, robot) as (process, station):
+    with running(tmp_path, robot, "null") as (process, station):
         while not (written := list_recordings(tmp_path / "recordings" / "stoch3")):
             time.sleep(0.05)
         assert station.next_status().mode == "DAMP"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trotd import cli_bench, cli_hardware, cli_station, cli_training
+from trotd import cli_bench, cli_hardware, cli_ros2, cli_station, cli_training
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -220,6 +220,7 @@ def clear(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOI
 
 cli_hardware.register(app)
 cli_station.register(app)
+cli_ros2.register(app)
 cli_training.register(app)
 cli_bench.register(app)
 
