@@ -43,7 +43,7 @@ class Calibration(Record, frozen=True, kw_only=True):
     mount: Quaternion
     """Sensor → body."""
     contact_baseline: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Vertical foot force that each leg's torque feigns while the robot hangs or stands still, N."""
+    """Vertical foot force that each leg's torque feigns while the robot stands still, N."""
     hash: Annotated[str, Meta(pattern=r"^([0-9a-f]{64})?$")] = ""
 
 

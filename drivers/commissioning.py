@@ -27,6 +27,8 @@ RANGE_TOLERANCE = 0.15
 """rad by which a measured range may differ from the model's."""
 LEAST_TILT = 0.15
 """rad by which the body must be tilted between two poses of the IMU."""
+LARGEST_BASELINE = 0.3
+"""Share of a leg's part of the weight that its torque may feign."""
 
 
 class CommissionError(DriverError):
@@ -110,15 +112,23 @@ def zeros_from_stops(
     lower, upper = np.array(description.joints.lower), np.array(description.joints.upper)
     ends = np.stack([direction * at_first / gear, direction * at_second / gear])
     low, high = ends.min(axis=0), ends.max(axis=0)
-    wrong = [
-        f"{joint_name(leg, joint)}: turned {high[leg, joint] - low[leg, joint]:.2f} rad from stop to stop, the model "
-        f"says {upper[leg, joint] - lower[leg, joint]:.2f}"
-        for leg, joint in np.argwhere(np.abs((high - low) - (upper - lower)) > RANGE_TOLERANCE)
-    ]
-    if wrong:
+    problems = (
+        range_problem(description, leg, joint, high[leg, joint] - low[leg, joint])
+        for leg in range(4)
+        for joint in range(3)
+    )
+    if wrong := [problem for problem in problems if problem]:
         raise CommissionError("; ".join(wrong) + ". Bring each joint to both of its stops, or mend the model")
     offsets: Array = (low + high) / 2 - (lower + upper) / 2
     return offsets
+
+
+def range_problem(description: RobotDescription, leg: int, joint: int, turned: float) -> str:
+    """What is wrong with a range, rad, measured from stop to stop; empty where it is the model's."""
+    wanted = description.joints.upper[leg][joint] - description.joints.lower[leg][joint]
+    if abs(turned - wanted) <= RANGE_TOLERANCE:
+        return ""
+    return f"{joint_name(leg, joint)}: turned {turned:.2f} rad from stop to stop, the model says {wanted:.2f}"
 
 
 def zeros_from_pose(motor: Array, pose: Array, direction: Array, gear: Array) -> Array:
@@ -174,9 +184,33 @@ def quaternion_of(rotation: Array) -> Array:
     return -quaternion if w < 0 else quaternion
 
 
-def contact_baseline(forces: Array) -> tuple[float, float, float, float]:
-    """Vertical force that each leg feigns while nothing touches it: median over samples (n, 4), N."""
-    a, b, c, d = np.median(forces, axis=0).tolist()
+def contact_baseline(forces: Array, feet: Array, weight: float, com: Array) -> tuple[float, float, float, float]:
+    """Vertical force that each leg's torque feigns while the robot stands still, N.
+
+    Forces that carry the weight obey three equations: their sum, and their moments about x and y. What the felt ones
+    disagree by is shared among the legs with the least norm. A load that the legs exchange diagonally obeys all three
+    and cannot be told from an error: it stays.
+
+    Args:
+        forces: felt, heading frame. Shape (n, 4).
+        feet: x and y from the body origin, heading frame, m. Shape (4, 2).
+        weight: of the robot, N.
+        com: x and y of the centre of mass from the body origin, heading frame, m. Shape (2,).
+
+    Raises:
+        CommissionError: a leg feigns too much to be an error of its torque sensing.
+    """
+    balance = np.vstack([np.ones(4), feet.T])
+    carried = weight * np.array([1.0, *com])
+    feigned = np.linalg.pinv(balance) @ (balance @ np.median(forces, axis=0) - carried)
+    bound = LARGEST_BASELINE * weight / 4
+    for leg, force in zip(LEGS, feigned.tolist(), strict=True):
+        if not abs(force) <= bound:
+            raise CommissionError(
+                f"{leg} feigns {force:+.0f} N, {bound:.0f} N is the most that is believed: does the robot carry a "
+                "load, does it stand still on level ground, are its zeros right?"
+            )
+    a, b, c, d = feigned.tolist()
     return a, b, c, d
 
 

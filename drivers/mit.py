@@ -85,6 +85,17 @@ _HALF = 0.5 + 1e-9
 """Half a step rounds down: zero, which lies between two steps, becomes the 7fff 7ff of the makers' examples."""
 
 
+def highest_id(model: str) -> int:
+    """The highest CAN id that a motor of ``model`` can have.
+
+    Raises:
+        ValueError: an unknown model.
+    """
+    if model not in RANGES:
+        raise ValueError(f"motors.model = {model!r}: the known ones are {', '.join(RANGES)}")
+    return 15 if RANGES[model].maker == "damiao" else 126
+
+
 class MitCodec:
     """Commands and replies of motors ``ids`` (1-15 for Damiao, 1-126 for CubeMars), all of one ``model``.
 
@@ -99,10 +110,8 @@ class MitCodec:
     latches = frozenset([_LOST_COMMUNICATION])
 
     def __init__(self, ids: Sequence[int], *, model: str, host: int = 0) -> None:
-        if model not in RANGES:
-            raise ValueError(f"motor model {model!r} is not known; the known ones are {', '.join(RANGES)}")
+        highest = highest_id(model)
         self.range = RANGES[model]
-        highest = 15 if self.range.maker == "damiao" else 126
         for motor in ids:
             if not 1 <= motor <= highest:
                 raise ValueError(f"motor id {motor}: 1 to {highest} for {model}")

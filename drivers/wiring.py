@@ -70,6 +70,8 @@ class MotorsConfig(Record, frozen=True, kw_only=True):
     """moteus: ``servo.pid_position.kd`` that the servos are configured with, N·m per revolution/s."""
     format: Format = "float"
     """moteus: ``float``, or ``compact`` for smaller frames with gains up to the servos' own."""
+    wiggle_torque: Positive = 3.0
+    """The most that commissioning's powered wiggle asks of one motor, N·m at the motor."""
     model: str = ""
     """MIT protocol: the motors' model, which tells its ranges."""
 

@@ -27,12 +27,14 @@ __all__ = [
     "RecordingEntry",
     "RecordingReply",
     "Request",
+    "SimHold",
     "SimPush",
     "SimTruth",
     "SolverStatus",
     "Status",
     "VelocityCommand",
     "VelocityMessage",
+    "decode_hold",
     "decode_push",
     "decode_request",
     "decode_velocity",
@@ -196,6 +198,8 @@ class SimTruth(msgspec.Struct, frozen=True):
     velocity: tuple[float, float, float]
     """vx, vy in the heading frame, m/s; yaw rate, rad/s."""
     fallen: bool
+    joints: tuple[float, ...] = ()
+    """Joint angles, row by row, rad."""
 
 
 class SimPush(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -205,6 +209,17 @@ class SimPush(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """N, heading frame, at the body origin."""
     duration: float
     """s."""
+
+
+class SimHold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """JSON on ``sim/hold``, heard by the wire twin only: somebody takes the body into the air and holds it."""
+
+    rpy: tuple[float, float, float]
+    """rad."""
+    joints: tuple[float, ...] = ()
+    """Where the joints are held, row by row, rad; none of them: they are let go."""
+    down: bool = False
+    """Put it back to where it started from, and let go."""
 
 
 class MessageError(ValueError):
@@ -272,6 +287,21 @@ def decode_push(data: bytes) -> SimPush:
     return message
 
 
+def decode_hold(data: bytes) -> SimHold:
+    """What ``sim/hold`` carries.
+
+    Raises:
+        MessageError: not JSON, not these keys, not finite, not twelve joints, or more than half a turn.
+    """
+    message = _decode(data, SimHold)
+    if len(message.joints) not in (0, 12):
+        raise MessageError(f"joints: {len(message.joints)} numbers; 12 or none are wanted")
+    for name, values in (("rpy", message.rpy), ("joints", message.joints)):
+        for index, value in enumerate(values):
+            _within(f"{name}[{index}]", value, math.pi)
+    return message
+
+
 class Keys:
     """The key expressions of one robot."""
 
@@ -290,6 +320,7 @@ class Keys:
         self.operator = f"{root}/operator"
         self.sim_truth = f"{root}/sim/truth"
         self.sim_push = f"{root}/sim/push"
+        self.sim_hold = f"{root}/sim/hold"
 
 
 def tick_schema() -> bytes:

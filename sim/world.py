@@ -32,6 +32,8 @@ from sim.urdf import read_model
 
 FAR = 100.0
 """Height at which nothing touches anything, m."""
+HELD_HEIGHT = 2.0
+"""Of the body's origin while it is held up, m."""
 JOINT_NAMES = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
 
 
@@ -104,6 +106,8 @@ class World:
         """
         self._start(scenario)
         self._ticks = 0
+        self._held: tuple[Array, Array | None] | None = None
+        self._scenario = scenario
         self._pushes = list(scenario.pushes)
         self.motors.reset(scenario.motor_strength, round(scenario.extra_delay / self._dt))
         self._states: Sequence[Any] = self._bullet.getJointStates(
@@ -151,6 +155,21 @@ class World:
         """From now until the reset, joint ``joint`` (0 to 11) only turns under more than ``torque``, N·m."""
         self._jammed.add(joint)
         self._brake(joint, torque)
+
+    def hold(self, rpy: tuple[float, float, float], joint_position: Array | None = None) -> None:
+        """Keep the body up in the air from now on, as hands or a stand do.
+
+        Args:
+            rpy: roll, pitch, yaw of the body, rad.
+            joint_position: where the joints are held, rad, (4, 3); None leaves them to the motors and gravity.
+        """
+        self._held = from_rpy(rpy), joint_position
+        self._keep_held(self._joint_arrays()[0] if joint_position is None else joint_position)
+        self._states = self._bullet.getJointStates(self._robot, self._joints, physicsClientId=self._client)
+
+    def set_down(self) -> None:
+        """End ``hold``: the robot is again where its last ``reset`` put it."""
+        self.reset(self._scenario)
 
     def fallen(self, tilt: float = 1.0) -> bool:
         """Whether the body touches the ground or leans by more than ``tilt`` rad."""
@@ -213,8 +232,16 @@ class World:
         )
         if self._pushes:
             self._apply_pushes((index + 0.5) * self._dt)
+        if self._held is not None:
+            self._keep_held(self._held[1])
         bullet.stepSimulation(physicsClientId=client)
         self._states = bullet.getJointStates(robot, self._joints, physicsClientId=client)
+
+    def _keep_held(self, joint_position: Array | None) -> None:
+        assert self._held is not None
+        self._place_body(np.array([0.0, 0.0, HELD_HEIGHT]), self._held[0], np.zeros(3))
+        if joint_position is not None:
+            self._place_joints(joint_position)
 
     def _apply_pushes(self, now: float) -> None:
         bullet = self._bullet
@@ -344,13 +371,19 @@ class World:
         self._com, self._principal = np.array(info[3]), from_xyzw(info[4])
 
     def _place(self, origin: Array, rotation: Array, velocity: Array, joint_position: Array) -> None:
+        self._place_body(origin, rotation, velocity)
+        self._place_joints(joint_position)
+
+    def _place_body(self, origin: Array, rotation: Array, velocity: Array) -> None:
         bullet, robot, client = self._bullet, self._robot, self._client
         w, x, y, z = to_quaternion(rotation @ self._principal)
         centre = (origin + rotation @ self._com).tolist()
         bullet.resetBasePositionAndOrientation(robot, centre, (x, y, z, w), physicsClientId=client)
         bullet.resetBaseVelocity(robot, velocity.tolist(), (0.0, 0.0, 0.0), physicsClientId=client)
+
+    def _place_joints(self, joint_position: Array) -> None:
         for joint, angle in zip(self._joints, np.ravel(joint_position).tolist(), strict=True):
-            bullet.resetJointState(robot, joint, angle, 0.0, physicsClientId=client)
+            self._bullet.resetJointState(self._robot, joint, angle, 0.0, physicsClientId=self._client)
 
     def _build_ground(self, terrain: Terrain) -> list[int]:
         bullet, client = self._bullet, self._client

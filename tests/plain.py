@@ -178,7 +178,7 @@ class PlainController:
         self.record["contact_force"] = force @ self.rotation.T
         in_world = feet @ self.to_world.T
         odometry, rolling = self.leg_odometry(q, joints.velocity, rate, feet)
-        self.feel_contacts(self.record["contact_force"][:, 2], odometry)
+        self.feel_contacts(self.record["contact_force"][:, 2] - self.config.contact.baseline, odometry)
         if not self.started:
             self.x = np.vstack([np.zeros(3), in_world])  # rows: velocity, then the four feet; columns: world axes
             self.covariance = np.diag([0.1] + [noise.foot_position_noise**2] * 4)

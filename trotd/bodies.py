@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
 
 from drivers.robot import Array, Robot
 from runtime.config import Config
 from runtime.link import Channel
-from runtime.messages import Keys, SimTruth, decode_push
+from runtime.messages import Keys, SimTruth, decode_hold, decode_push
 
 if TYPE_CHECKING:
     from sim.world import World
@@ -113,7 +114,8 @@ def truth_message(world: World, stamp: float) -> bytes:
     forward, left = _turned(truth.linear_velocity[0], truth.linear_velocity[1], -yaw)
     x, y, z = truth.position.tolist()
     velocity = (forward, left, float(truth.angular_velocity[2]))
-    return msgspec.json.encode(SimTruth(stamp, (x, y, z), (roll, pitch, yaw), velocity, bool(world.fallen())))
+    joints = tuple(truth.joint_position.ravel().tolist())
+    return msgspec.json.encode(SimTruth(stamp, (x, y, z), (roll, pitch, yaw), velocity, bool(world.fallen()), joints))
 
 
 def push_world(world: World, data: bytes) -> None:
@@ -126,6 +128,19 @@ def push_world(world: World, data: bytes) -> None:
     _, _, yaw = _rpy(world.truth.rotation_body_to_world)
     x, y = _turned(push.force[0], push.force[1], yaw)
     world.push((x, y, push.force[2]), push.duration)
+
+
+def hold_world(world: World, data: bytes) -> None:
+    """Do what a message on ``sim/hold`` asks.
+
+    Raises:
+        MessageError: it asks nonsense.
+    """
+    hold = decode_hold(data)
+    if hold.down:
+        world.set_down()
+        return
+    world.hold(hold.rpy, np.array(hold.joints).reshape(4, 3) if hold.joints else None)
 
 
 def _rpy(rotation: Array) -> tuple[float, float, float]:

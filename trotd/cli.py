@@ -115,10 +115,10 @@ def run(
         config, path = _load(robot, rate_hz, listen)
         chosen = policies.load(policies.find_policy(policy or config.control.policy, path.parent), config.robot.name)
         place = folder or state_folder()
-        if body == "twin":
-            from trotd.wire import lenient
+        if body in ("hardware", "twin"):
+            from trotd.wire import lenient, with_baseline
 
-            config = lenient(config)
+            config = with_baseline(body, lenient(config) if body == "twin" else config, place)
         part = build_body(body, config, path, place, observe)
         memory = memory_folder(place)
         job = daemon.Job(config, path.read_text(), chosen, part.robot, place, part.channels, _say_ready, memory)

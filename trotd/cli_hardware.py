@@ -65,10 +65,15 @@ def twin(
         serve_twin(loaded, folder or state_folder(), connect, TwinOptions(scramble, product, noise))  # type: ignore[arg-type]
 
 
-def check(robot: RobotOption = "stoch3", body: BodyOption = "hardware", folder: StateOption = None) -> None:
+def check(
+    robot: RobotOption = "stoch3",
+    body: BodyOption = "hardware",
+    folder: StateOption = None,
+    json: Annotated[bool, typer.Option("--json", help="The rows as JSON, for machines.")] = False,
+) -> None:
     """Look at every motor, the IMU, the wires and this computer before anything moves; energises nothing.
 
-    Exit code 1 if anything failed.
+    Exit code 1 if anything failed; warnings alone are 0.
     """
     with _one_line_errors():
         import asyncio
@@ -77,51 +82,56 @@ def check(robot: RobotOption = "stoch3", body: BodyOption = "hardware", folder: 
 
         from runtime import config
         from runtime.state import state_folder
-        from trotd import check as pre_flight
+        from trotd.check import command as pre_flight
+        from trotd.check.rows import passed, print_json, print_table
 
         loaded = config.load(config.find_robot(robot))
-        rows = asyncio.run(pre_flight.check(body, loaded, folder or state_folder()))
+        with Console(stderr=True).status("asking motors, IMU and kernel"):
+            rows = asyncio.run(pre_flight.check(body, loaded, folder or state_folder()))
         console = Console()
-        if not pre_flight.show(rows, Console(width=max(console.width, 120))):
+        if json:
+            print_json(rows)
+        else:
+            print_table(rows, Console(width=max(console.width, 120)))
+        if not passed(rows):
             raise typer.Exit(FAILED)
 
 
 def commission(
     robot: RobotOption = "stoch3",
     body: BodyOption = "hardware",
-    undo: Annotated[str | None, typer.Option(help="Do a step again: joints, stops or mount.")] = None,
+    wiggle: Annotated[
+        bool, typer.Option("--wiggle", help="Motors turn a little by their own power; you say what moved.")
+    ] = False,
+    jig: Annotated[
+        str | None,
+        typer.Option(help="Zeros from a jig that holds all legs at abduction,hip,knee, rad; else from end stops."),
+    ] = None,
+    undo: Annotated[str | None, typer.Option(help="Forget a step: joints, zeros, mount or baseline.")] = None,
+    anew: Annotated[bool, typer.Option("--anew", help="Forget all that was found.")] = False,
+    baseline: Annotated[
+        bool, typer.Option("--baseline", help="Last step: the robot stands under its daemon; listen to its legs.")
+    ] = False,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="With --body twin: the twin's own hands do what is asked.")
+    ] = False,
+    connect: Annotated[str, typer.Option(help="Endpoint of the daemon.", metavar="ENDPOINT")] = "tcp/127.0.0.1:7447",
     folder: StateOption = None,
 ) -> None:
-    """Find out how a robot is put together: ids, signs, zeros, the IMU's mount. Energises nothing; can be interrupted.
+    """Find out how a robot is put together: ids, signs, zeros, the IMU's mount. Writes its calibration.
 
-    People turn the joints, the encoders tell what moved. Writes the calibration that a daemon needs.
+    Can be interrupted and goes on where it was. Energises nothing, unless --wiggle says so. By hand: people turn
+    the joints, the encoders tell what moved. A daemon does not start without a calibration that is valid for its robot.
+
+    Afterwards, with the robot standing under `trotd run`: `trotd commission --baseline`, and start the daemon anew.
     """
     with _one_line_errors():
-        from drivers import calibration
         from runtime import config
         from runtime.state import state_folder
-        from trotd.commission import STEPS, Commission
-        from trotd.commission_wires import CommissionWires
-        from trotd.wire import calibration_file, wires_of
+        from trotd.commission import command
 
         place = folder or state_folder()
+        choices = command.Choices(body, wiggle, jig, undo, anew, rehearse, connect)
         loaded = config.load(config.find_robot(robot))
-        wires = wires_of(body, loaded, place)
-        path = calibration_file(body, loaded, place)
-        with CommissionWires(wires) as readings:
-            work = Commission(
-                loaded,
-                wires.motors,
-                path.with_suffix(".progress.json"),
-                readings.motors,
-                readings.force,
-                lambda text: typer.prompt(f"{text}; then Enter", default="", show_default=False) and None,
-            )
-            if undo is not None:
-                steps = [step for step in STEPS if step == undo]
-                if not steps:
-                    raise ValueError(f"--undo {undo}: {', '.join(STEPS)}")
-                work.undo(steps[0])
-            calibration.save(work.run(), path)
-        work.path.unlink(missing_ok=True)
-        typer.echo(f"calibration: {path}")
+        act = command.listen_to_legs if baseline else command.commission
+        act(loaded, place, choices, typer.echo)

@@ -29,7 +29,7 @@ from sim.scenario import Noise, Scenario
 from sim.twin import RATE_HZ, REAL_NOISE, TwinSetup, WireTwin, run_twin
 from sim.world import World
 from sim.xbus_emulator import Product
-from trotd.bodies import push_world, truth_message
+from trotd.bodies import hold_world, push_world, truth_message
 from trotd.wire import IMU_LINK, KNOWN, MEETING, favour, own_wires, twin_folder, twin_wires
 
 TRUTH_EVERY = round(RATE_HZ / 100)
@@ -124,14 +124,18 @@ def _told(robot: str, endpoint: str, world: World) -> Iterator[Callable[[], None
     steps = 0
     with zenoh.open(settings) as session:
         truth = session.declare_publisher(keys.sim_truth)
-        heard = session.declare_subscriber(keys.sim_push, zenoh.handlers.RingChannel(16))
+        heard = [
+            (act, session.declare_subscriber(key, zenoh.handlers.RingChannel(16)))
+            for key, act in ((keys.sim_push, push_world), (keys.sim_hold, hold_world))
+        ]
 
         def tell() -> None:
             nonlocal steps
             steps += 1
-            while (sample := heard.try_recv()) is not None:
-                with contextlib.suppress(MessageError):
-                    push_world(world, sample.payload.to_bytes())
+            for act, channel in heard:
+                while (sample := channel.try_recv()) is not None:
+                    with contextlib.suppress(MessageError):
+                        act(world, sample.payload.to_bytes())
             if steps % TRUTH_EVERY == 0:
                 truth.put(truth_message(world, time.monotonic()))
 

@@ -95,6 +95,20 @@ def wired_body(kind: str, config: Config, folder: Path, observe: bool) -> Hardwa
     return HardwareRobot.build(config.robot, wires.bus, motors, imu, observe=observe)
 
 
+def with_baseline(kind: str, config: Config, folder: Path) -> Config:
+    """``config`` with the foot forces that this body's legs feign, where its calibration tells.
+
+    Raises:
+        DriverError: no wires, or a calibration that is not valid for this robot now.
+    """
+    path = calibration_file(kind, config, folder)
+    if not path.exists():
+        return config
+    found = calibration.load(path, config.robot, own_wires(config).motors)
+    contact = msgspec.structs.replace(config.control.contact, baseline=found.contact_baseline)
+    return msgspec.structs.replace(config, control=msgspec.structs.replace(config.control, contact=contact))
+
+
 def lenient(config: Config) -> Config:
     """``config`` with the one bound of the guard that a busy computer would pass instead of a robot."""
     limits = msgspec.structs.replace(config.limits, max_age=max(config.limits.max_age, TWIN_MAX_AGE))

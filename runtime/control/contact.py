@@ -32,13 +32,14 @@ def feel_contacts(p, s, t, m):  # type: ignore[no-untyped-def]
     """Contact of every foot from the vertical force, with hysteresis; early in a swing none can begin, only end.
 
     Contact begins on the low-passed force: the inertia of a swinging leg tells forces of its own that change sign from
-    tick to tick, a landing does not. A foot that moves over the ground while another one rests is in the air whatever
-    its torque says (``lifted``): the force that an unloaded leg is given feels like ground until the leg has run away.
+    tick to tick, a landing does not. What commissioning found a leg to feign (``contact_baseline``) is taken off first.
+    A foot that moves over the ground while another one rests is in the air whatever its torque says (``lifted``): the
+    force that an unloaded leg is given feels like ground until the leg has run away.
     """
     follow = p.dt / (p.dt + p.force_time_constant)
     resting = 0
     for leg in range(4):
-        force = t.contact_force[leg, 2]
+        force = t.contact_force[leg, 2] - p.contact_baseline[leg]
         s.pressure[leg] += (force - s.pressure[leg]) * (follow if s.started else 1.0)
         if s.contacts[leg]:
             s.contacts[leg] = force > p.contact_release

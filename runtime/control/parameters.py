@@ -61,6 +61,8 @@ class ContactConfig(Record, frozen=True, kw_only=True):
     """Low-pass of the force that begins a contact, s."""
     lift_speed: Positive = 1.5
     """A foot that moves faster over the ground, while another one rests, is in the air, m/s."""
+    baseline: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Vertical force that each leg's torque feigns, N; the calibration has the last word."""
 
 
 class GrfConfig(Record, frozen=True, kw_only=True):

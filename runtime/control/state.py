@@ -113,6 +113,7 @@ PARAMETERS_DTYPE = np.dtype(
         ("contact_blanking", "f8"),
         ("force_time_constant", "f8"),
         ("lift_speed", "f8"),
+        ("contact_baseline", "f8", (4,)),
         # estimator
         ("acceleration_noise", "f8"),
         ("foot_position_noise", "f8"),
@@ -188,6 +189,7 @@ def build_parameters(description: RobotDescription, config: ControlConfig) -> Re
     p["contact_threshold"], p["contact_release"] = contact.threshold, contact.release * contact.threshold
     p["contact_blanking"] = contact.blanking * np.pi
     p["force_time_constant"], p["lift_speed"] = contact.force_time_constant, contact.lift_speed
+    p["contact_baseline"] = contact.baseline
     for name in config.estimator.__struct_fields__:
         p[name] = getattr(config.estimator, name)
     for name in ("friction", "min_force", "max_force", "wrench_weight", "force_weight"):
