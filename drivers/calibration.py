@@ -14,7 +14,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from drivers.description import Name, PerLeg, Record, RobotDescription
+from drivers.description import UNDECODABLE, Name, PerLeg, Record, RobotDescription
 from drivers.durable import write_whole
 from drivers.errors import DriverError
 from drivers.wiring import ImuConfig, MotorsConfig, PerLegBuses, PerLegDirections, PerLegIds, Quaternion
@@ -86,7 +86,7 @@ def load(path: Path, description: RobotDescription, motors: MotorsConfig, now: d
     _check_version(data, path)
     try:
         calibration = msgspec.json.decode(data, type=Calibration)
-    except msgspec.ValidationError as error:
+    except UNDECODABLE as error:
         raise CalibrationError(f"calibration {path}: {error}; run trotd commission") from error
     for wrong, words in (
         (calibration.robot != description.name, f"is of robot {calibration.robot!r}, this is {description.name!r}"),
@@ -114,7 +114,7 @@ def apply(calibration: Calibration, motors: MotorsConfig, imu: ImuConfig) -> tup
 def _check_version(data: bytes, path: Path) -> None:
     try:
         version = msgspec.json.decode(data).get("version")
-    except (msgspec.DecodeError, AttributeError) as error:
+    except (*UNDECODABLE, AttributeError) as error:
         raise CalibrationError(f"calibration {path}: not JSON of ours; run trotd commission") from error
     if version != VERSION:
         age = "newer" if isinstance(version, int) and version > VERSION else "stale"

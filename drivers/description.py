@@ -28,6 +28,10 @@ END = np.array([1.0, 1.0, -1.0, -1.0])
 """+1 for front legs, -1 for back ones. Shape (4,)."""
 
 
+UNDECODABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+"""What msgspec raises on bytes that it cannot make a record of: wrong, not UTF-8, nested too deeply."""
+
+
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of every configuration record: frozen, keyword-only, unknown keys are errors."""
 

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import msgspec
 
+from drivers.description import UNDECODABLE
 from runtime.control.observation import OBSERVATION_NAMES
 from runtime.control.policy import GRF_NAMES, SHIFT_NAMES, WRENCH_NAMES, Policy
 from runtime.control.state import HIDDEN
 
 SHIPPED = Path(__file__).parent / "policies"
+FORMAT = 1
+"""Of the files that are read and written."""
 LARGEST_FILE = 4_000_000
 """Bytes; a policy of 504 numbers needs 15 000."""
 
@@ -61,11 +64,24 @@ def decode(data: bytes, robot: str, place: str) -> Policy:
     if len(data) > LARGEST_FILE:
         raise PolicyError(f"{place}: {len(data)} bytes; a policy has at most {LARGEST_FILE}")
     try:
+        _check_format(msgspec.json.decode(data, type=_Formatted).format, place)
         policy = msgspec.json.decode(data, type=Policy)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except UNDECODABLE as error:
         raise PolicyError(f"{place}: {error}") from error
     verify(policy, robot, place)
     return policy
+
+
+class _Formatted(msgspec.Struct):
+    """A file of any version: all have this key."""
+
+    format: int
+
+
+def _check_format(version: int, place: str) -> None:
+    if version != FORMAT:
+        advice = "update trotd" if version > FORMAT else "train or export it anew"
+        raise PolicyError(f"{place}: format = {version}: this program reads {FORMAT}; {advice}")
 
 
 def verify(policy: Policy, robot: str, place: str) -> None:

@@ -8,6 +8,7 @@ record's layout and what happened.
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 import time
 from collections.abc import Iterable
@@ -18,12 +19,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from drivers.description import UNDECODABLE
 from drivers.durable import replacing
 from runtime.control.records import Records
 from runtime.messages import TICK_DTYPE, Event
 
-MAGIC = b"trotd recording 1\n"
+VERSION = 1
+_MARK = b"trotd recording "
+MAGIC = _MARK + b"%d\n" % VERSION
 SUFFIX = ".trotd"
+_PLAIN = re.compile(r"[<>|][iuf][1248]")
+"""Numbers alone: an object in a file is somebody else's program."""
 _length = struct.Struct("<Q")
 
 
@@ -118,8 +124,7 @@ def load(path: Path) -> Recording:
     """
     try:
         with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                raise RecordingError(f"{path}: not a trotd recording")
+            _check_mark(file.readline(len(_MARK) + 8), path)
             size = file.read(_length.size)
             length = _length.unpack(size)[0] if len(size) == _length.size else -1
             encoded = file.read(length) if 0 <= length <= path.stat().st_size else b""
@@ -127,9 +132,20 @@ def load(path: Path) -> Recording:
             body = file.read()
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except UNDECODABLE as error:
         raise RecordingError(f"{path}: header: {error}") from error
     return Recording(path, header, _records(path, header, body))
+
+
+def _check_mark(line: bytes, path: Path) -> None:
+    """What a file begins with tells its version; another one's layout is not guessed."""
+    if line == MAGIC:
+        return
+    number = line.removeprefix(_MARK).removesuffix(b"\n")
+    if not line.startswith(_MARK) or not number.isdigit():
+        raise RecordingError(f"{path}: not a trotd recording")
+    advice = "update trotd" if int(number) > VERSION else "read it with the trotd that wrote it"
+    raise RecordingError(f"{path}: version {int(number)}, this program reads {VERSION}; {advice}")
 
 
 def _records(path: Path, header: Header, body: bytes) -> Records:
@@ -146,6 +162,8 @@ def dtype_of(header: Header, place: str) -> np.dtype[Any]:
         RecordingError: it is none; ``place`` is how the message names where it came from.
     """
     names, types, shapes, offsets = zip(*header.layout, strict=True) if header.layout else ((), (), (), ())
+    if not all(_PLAIN.fullmatch(kind) for kind in types):
+        raise RecordingError(f"{place}: layout: fields of type {', '.join(sorted(set(types)))[:80]}")
     try:
         return np.dtype(
             {

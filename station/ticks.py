@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import zenoh
 
+from drivers.description import UNDECODABLE
 from runtime.control.records import Records
 from runtime.messages import TICK_DTYPE, Event
 from station.session import Station, StationError
@@ -53,7 +54,7 @@ def read_schema(data: bytes) -> np.dtype[np.void]:
                 "itemsize": schema.itemsize,
             }
         )
-    except (msgspec.MsgspecError, TypeError, ValueError) as error:
+    except (*UNDECODABLE, TypeError, ValueError) as error:
         raise StationError(f"tick schema: {error}") from error
     check_fields(dtype, "the robot's ticks")
     return dtype

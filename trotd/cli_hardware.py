@@ -27,13 +27,14 @@ def _one_line_errors() -> Iterator[None]:
     """Bad input ends with one line and code 2; what the wires refuse with its report and code 1."""
     from drivers.errors import DriverError
     from runtime.config import ConfigError
+    from station.session import StationError
 
     try:
         yield
     except (ConfigError, ImportError, ValueError) as error:
         typer.echo(f"trotd: {error}", err=True)
         raise typer.Exit(FAILED if isinstance(error, DriverError) else BAD_INPUT) from error
-    except (DriverError, OSError) as error:
+    except (DriverError, StationError, OSError) as error:
         typer.echo(f"trotd: {error}", err=True)
         raise typer.Exit(FAILED) from error
 

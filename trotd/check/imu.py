@@ -70,9 +70,7 @@ def judge_health(counters: ImuCounters) -> list[Row]:
     if counters.self_test_failed:
         rows.append(Row("IMU self test", "fail", "failed", "switch it off and on; else it is broken"))
     if counters.clipped:
-        rows.append(
-            Row("IMU range", "warn", f"{counters.clipped} samples clipped", "hold still; is it loose?")
-        )
+        rows.append(Row("IMU range", "warn", f"{counters.clipped} samples clipped", "hold still; is it loose?"))
     return rows
 
 

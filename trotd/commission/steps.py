@@ -31,7 +31,11 @@ from drivers.commissioning import (
     zeros_from_pose,
     zeros_from_stops,
 )
+<<<<<<< HEAD
 from drivers.durable import write_whole
+=======
+from drivers.description import UNDECODABLE
+>>>>>>> 2c1b272 (Fuzzing of every door; what it found refused by name)
 from drivers.robot import JOINTS, LEGS, Array
 from drivers.wiring import Direction, MotorsConfig
 from runtime.config import Config
@@ -156,7 +160,7 @@ class Commission:
             return Progress(robot=self.config.robot.name)
         try:
             progress = msgspec.json.decode(self.path.read_bytes(), type=Progress)
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        except UNDECODABLE as error:
             raise CommissionError(f"{self.path}: {error}; begin anew with --anew") from error
         if progress.version != PROGRESS_VERSION:
             raise CommissionError(
