@@ -34,7 +34,9 @@ class MitEmulator:
         if data == ENABLE:
             self.enabled, self._drive = True, LIMP
         elif data == DISABLE:
-            self.enabled, self.fault = False, 0
+            self.enabled = False
+            reply, self.fault = self._reply(), 0  # it tells once what it then forgets
+            return self.host, reply
         elif data == SET_ZERO:
             self._zero, self.position = self._zero + self.position, 0.0
         else:

@@ -128,7 +128,34 @@ def test_a_body_that_is_moved_is_not_at_rest():
         mount_from_gravity(np.array([0.0, 0.0, 11.0]), np.zeros(3), np.zeros(3))
 
 
-def test_the_baseline_is_not_moved_by_a_touch():
-    forces = np.tile([1.0, -2.0, 3.0, 0.5], (101, 1))
-    forces[:30, 0] = 80.0
-    assert contact_baseline(forces) == (1.0, -2.0, 3.0, 0.5)
+FEET = np.array([[0.27, 0.22], [0.27, -0.22], [-0.27, 0.22], [-0.27, -0.22]])
+DIAGONAL = np.array([1.0, -1.0, -1.0, 1.0])
+WEIGHT = 245.0
+
+
+def standing(com: np.ndarray) -> np.ndarray:
+    """Forces of four feet that carry ``WEIGHT`` at ``com``, without any load exchanged diagonally."""
+    balance = np.vstack([np.ones(4), FEET.T])
+    return np.linalg.pinv(balance) @ (WEIGHT * np.array([1.0, *com]))
+
+
+@given(
+    st.tuples(*[st.floats(-8, 8)] * 4).map(np.array),
+    st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)).map(np.array),
+    st.floats(-20, 20),
+)
+def test_what_the_legs_feign_is_found_but_for_what_they_exchange_diagonally(feigned, com, exchanged):
+    forces = np.tile(standing(com) + feigned + exchanged * DIAGONAL, (101, 1))
+    forces[:30, 0] += 80.0  # somebody touched it for a moment
+    found = np.array(contact_baseline(forces, FEET, WEIGHT, com))
+    hidden = feigned @ DIAGONAL / 4 * DIAGONAL
+    assert found == pytest.approx(feigned - hidden, abs=1e-6)
+    balance = np.vstack([np.ones(4), FEET.T])
+    assert balance @ (forces[-1] - found) == pytest.approx(WEIGHT * np.array([1.0, *com]), abs=1e-6)
+
+
+@pytest.mark.parametrize("load", [80.0, np.nan])
+def test_a_load_is_no_baseline(load):
+    com = np.zeros(2)
+    with pytest.raises(CommissionError, match="does the robot carry a load"):
+        contact_baseline(np.tile(standing(com) + load / 4, (10, 1)), FEET, WEIGHT, com)

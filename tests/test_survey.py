@@ -1,24 +1,23 @@
-"""Who is on the buses, and the judgement of the pre-flight about it."""
+"""Who is on the buses, asked without energising anything, whatever protocol they speak."""
 
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
 
 import numpy as np
 import pytest
 from bench_robot import Bench
 
 from drivers.errors import DriverError
-from drivers.survey import survey
+from drivers.survey import MitQuestion, MoteusQuestion, build_question, survey
+from sim.mit_emulator import MitEmulator
 from sim.moteus_emulator import MoteusEmulator
-from trotd.check import check_system, check_timing, judge_gravity, judge_motors
 
-WANTED = {(1, 11): "FL abduction", (1, 12): "FL hip", (2, 21): "FR abduction"}
+MIT_IDS = ((1, 2, 3), (4, 5, 6), (7, 8, 9), (10, 11, 12))
 
 
-def find(bench: Bench):
-    return asyncio.run(survey(bench.bus, range(1, 5)))
+def find(bench: Bench, ids=None):
+    return asyncio.run(survey(bench.bus, range(1, 5), build_question(bench.motors.config), ids))
 
 
 def test_everybody_is_found_as_it_is_and_nobody_is_energised():
@@ -34,55 +33,46 @@ def test_everybody_is_found_as_it_is_and_nobody_is_energised():
     assert {servo.mode for servo in bench.servos} <= {0, 1}
 
 
+@pytest.mark.parametrize(("model", "fault", "words"), [("DM4340", 9, "under-voltage"), ("AK80-9", 5, "encoder fault")])
+def test_mit_motors_are_found_too_and_stay_disabled(model, fault, words):
+    bench = Bench(protocol="mit", model=model, id=MIT_IDS)
+    bench.servos[0].fault = fault
+    bench.servos[1].sense(1.25, 0.0, 0.0, 41.0)
+    bench.servos[2].silent = True
+    bench.servos[3].enabled = True
+    found = {(motor.bus, motor.id): motor for motor in find(bench)}
+    assert len(found) == 11
+    assert words in found[1, 1].state
+    assert (found[1, 2].state, found[1, 2].temperature, found[1, 2].firmware) == ("disabled", 41.0, "")
+    assert found[1, 2].position == pytest.approx(1.25, abs=1e-3)
+    assert np.isnan(found[1, 2].voltage)
+    assert not any(servo.enabled for servo in bench.servos)
+
+
+def test_all_ids_of_the_protocol_are_tried_where_none_are_named():
+    assert MitQuestion("DM4340").ids == range(1, 16)
+    assert MitQuestion("AK80-9").ids == MoteusQuestion().ids == range(1, 127)
+    bench = Bench()
+    bench.bus.servos[3, 126] = MoteusEmulator(126)
+    assert (4, 126) in {(motor.bus, motor.id) for motor in find(bench)}
+    assert find(bench, [11]) == [motor for motor in find(bench) if motor.id == 11]
+
+
 def test_two_motors_with_one_id_answer_twice():
     bench = Bench()
     bench.bus.servos[0, 99] = MoteusEmulator(11)
     assert {(m.bus, m.id): m.replies for m in find(bench)}[1, 11] == 2
+    mit = Bench(protocol="mit", model="AK80-9", id=MIT_IDS)
+    mit.bus.servos[0, 99] = MitEmulator(2, "AK80-9")
+    assert {(m.bus, m.id): m.replies for m in find(mit)}[1, 2] == 2
 
 
-def test_each_motor_gets_its_row():
+def test_what_is_no_answer_is_nobody():
     bench = Bench()
-    bench.servos[0].fail(40)
-    bench.servos[3].silent = True
-    rows = {row.what: row for row in judge_motors(WANTED, find(bench))}
-    assert rows["FL abduction (id 11, bus 1)"].verdict == "fail"
-    assert "under-voltage" in rows["FL abduction (id 11, bus 1)"].found
-    assert rows["FL hip (id 12, bus 1)"].verdict == "ok"
-    assert rows["FR abduction (id 21, bus 2)"].found == "no answer"
-    assert rows["id 13, bus 1"].verdict == "warn"
-    assert len(rows) == 3 + 9
-
-
-def test_a_motor_on_the_wrong_bus_is_pointed_at():
-    bench = Bench(bus=((2, 1, 1), (2, 2, 2), (3, 3, 3), (4, 4, 4)))
-    rows = {row.what: row for row in judge_motors(WANTED, find(bench))}
-    assert "answers on bus 2" in rows["FL abduction (id 11, bus 1)"].advice
-
-
-@pytest.mark.parametrize(
-    ("force", "verdict"),
-    [
-        ((0.0, 0.0, 9.8), "ok"),
-        ((0.5, 0.0, 9.78), "ok"),
-        ((0.0, 0.0, -9.8), "fail"),
-        ((0.0, 6.0, 7.75), "warn"),
-        ((0.0, 0.0, 8.0), "fail"),
-        ((0.0, 0.0, 0.0), "fail"),
-    ],
-)
-def test_gravity_must_have_its_size_and_direction(force, verdict):
-    assert judge_gravity(np.array(force)).verdict == verdict
-
-
-def test_system_and_timing_are_told(tmp_path: Path):
-    governor = tmp_path / "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"
-    governor.parent.mkdir(parents=True)
-    governor.write_text("powersave\n")
-    rows = {row.what: row for row in check_system(tmp_path)}
-    assert (rows["CPU governor"].verdict, rows["CPU governor"].advice) == ("warn", "performance")
-    assert rows["isolated cores"].verdict == "warn"
-    (timing,) = asyncio.run(check_timing(200.0, 0.1))
-    assert "lateness" in timing.found
+    bench.bus.fault = lambda reply: [(reply[0], reply[1], b"\x2f\x01")]
+    assert find(bench) == []
+    bench.bus.fault = lambda reply: [(reply[0], reply[1] | 0x7F, reply[2])]
+    assert find(bench) == []
 
 
 def test_a_bus_that_is_missing_is_an_error_and_not_an_empty_table():

@@ -20,7 +20,7 @@ LEAST_PRIORITY, LEAST_LOCKED = 1, 1 << 28
 """Of the limits: real-time priority, and bytes of locked memory."""
 
 
-async def check_timing(rate_hz: float, seconds: float = SOAK_TIME) -> Row:
+async def check_timing(rate_hz: float, seconds: float) -> Row:
     """How late ticks wake at ``rate_hz`` when nothing else is done in them."""
     lateness = []
     with Ticker(rate_hz) as ticker:
