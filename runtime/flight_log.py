@@ -19,6 +19,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import TypeVar
 
+import msgspec
+
 from runtime import crash
 from runtime.config import Config
 from runtime.cycle import Cycle
@@ -211,6 +213,7 @@ class FlightLog:
         return Header(
             robot=self._config.robot.name,
             robot_toml=self._robot_toml,
+            config=msgspec.to_builtins(self._config),
             policy=policies[active].decode(),
             rate_hz=self._config.control.rate_hz,
             reason=reason,

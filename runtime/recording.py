@@ -42,6 +42,9 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
 
     robot: str
     robot_toml: str
+    """The robot's file, whole."""
+    config: dict[str, Any] = {}
+    """What it ran with: the file, changed by the command line and the calibration; empty from older versions."""
     policy: str
     """The active policy's file, whole."""
     rate_hz: float

@@ -83,7 +83,9 @@ class Player:
         if recording.ticks.dtype != TICK_DTYPE:
             raise ReplayError(f"{place}: its ticks have the layout of another version")
         self.config = config.override(
-            config.parse(tomllib.loads(header.robot_toml), place), place, {"control.rate_hz": header.rate_hz}
+            config.parse(header.config or tomllib.loads(header.robot_toml), place),
+            place,
+            {"control.rate_hz": header.rate_hz},
         )
         self._recording = recording
         self._ticks = recording.ticks

@@ -164,7 +164,7 @@ class World:
             joint_position: where the joints are held, rad, (4, 3); None leaves them to the motors and gravity.
         """
         self._held = from_rpy(rpy), joint_position
-        self._keep_held(self._joint_arrays()[0] if joint_position is None else joint_position)
+        self._keep_held(joint_position)
         self._states = self._bullet.getJointStates(self._robot, self._joints, physicsClientId=self._client)
 
     def set_down(self) -> None:

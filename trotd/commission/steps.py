@@ -31,11 +31,8 @@ from drivers.commissioning import (
     zeros_from_pose,
     zeros_from_stops,
 )
-<<<<<<< HEAD
-from drivers.durable import write_whole
-=======
 from drivers.description import UNDECODABLE
->>>>>>> 2c1b272 (Fuzzing of every door; what it found refused by name)
+from drivers.durable import write_whole
 from drivers.robot import JOINTS, LEGS, Array
 from drivers.wiring import Direction, MotorsConfig
 from runtime.config import Config
