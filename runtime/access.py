@@ -100,11 +100,11 @@ def rules(robot: str) -> dict[str, Any]:
     everything = f"{keys.root}/**"
     seeing = [
         _rule("see", _LISTENING, [everything]),
-        _rule("ask", ["query"], [keys.tick_schema, keys.event, keys.recording]),
+        _rule("ask", ["query"], [keys.tick_schema, keys.event, keys.recording, keys.policies, keys.tuning]),
     ]
     driving = [
-        _rule("steer", ["put"], [keys.velocity]),
-        _rule("change-mode", ["query"], [keys.mode]),
+        _rule("steer", ["put"], [keys.velocity, keys.pose]),
+        _rule("change-mode", ["query"], [keys.mode, keys.change_tuning]),
         _rule("hold-token", ["liveliness_token"], [f"{keys.operator}/*"]),
     ]
     teaching = [_rule("send-policy", ["query"], [keys.policy])]

@@ -15,6 +15,7 @@ from drivers.description import Record, RobotDescription
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
 from runtime.control.parameters import ControlConfig
 from runtime.parameters import (
+    AuditionConfig,
     CommandConfig,
     DampConfig,
     LimitsConfig,
@@ -23,6 +24,7 @@ from runtime.parameters import (
     RealtimeConfig,
     RecorderConfig,
     TourConfig,
+    TuningConfig,
 )
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -42,6 +44,8 @@ class Config(Record, frozen=True, kw_only=True):
     command: CommandConfig = CommandConfig()
     damp: DampConfig = DampConfig()
     link: LinkConfig = LinkConfig()
+    audition: AuditionConfig = AuditionConfig()
+    tuning: TuningConfig = TuningConfig()
     recorder: RecorderConfig = RecorderConfig()
     realtime: RealtimeConfig = RealtimeConfig()
     tour: TourConfig = TourConfig()
@@ -129,6 +133,10 @@ def _contradictions(config: Config) -> Iterator[str]:
         yield f"control.gait.walking_height = {height}: the leg reaches {config.robot.reach:.3f} m"
     if grf.min_force >= grf.max_force:
         yield f"control.grf.min_force = {grf.min_force}: must be below max_force = {grf.max_force}"
+    for name in config.tuning.__struct_fields__:
+        bounds = getattr(config.tuning, name)
+        if isinstance(bounds, tuple) and not bounds[0] < bounds[1]:
+            yield f"tuning.{name} = {list(bounds)}: the lower bound must be below the upper one"
     if limits.arming_tilt > limits.max_tilt:
         yield f"limits.arming_tilt = {limits.arming_tilt}: must not pass max_tilt = {limits.max_tilt}"
     if limits.arming_temperature > limits.max_temperature:

@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.robot import JointCommand, Measurement, damp_command
+from drivers.robot import Array, JointCommand, Measurement, damp_command
 from runtime import modes
 from runtime.config import Config
-from runtime.control.controller import Controller
+from runtime.control.controller import Controller, alike
 from runtime.control.policy import Policy
 from runtime.control.posture import POSTURE_DTYPE, Posture, blend, minimum_jerk
 from runtime.control.records import CONTROL_DTYPE, Clamp, Records, SolverStatus, VelocityCommand
 from runtime.control.state import STATE_DTYPE
 from runtime.limits import Guard
-from runtime.messages import CONTROL_OFFSET, TICK_DTYPE, Event, Mode, Request
+from runtime.messages import CONTROL_OFFSET, TICK_DTYPE, TUNED, Event, Mode, Request
 from runtime.modes import Answer, ModeState, Reason
 
 EVENTS = 256
@@ -90,6 +90,8 @@ class Cycle:
         """What happened and was not yet told."""
         self.generation = 1
         """Number of policies that were active so far."""
+        self.outgoing = 0
+        """Generation of the policy that is being handed over from; 0 for none."""
         self.clamps = [0] * len(Clamp)
         """How often each clamp acted."""
         self.solver = [0] * len(SolverStatus)
@@ -108,6 +110,7 @@ class Cycle:
         self._problems: Sequence[str] = ()
         self._row = self.tick[0]  # a view: what is written into it is in the record
         self._views = {name: self.tick[name][0] for name in TICK_DTYPE.names or () if self.tick[name].ndim > 1}
+        self._tuned = self.tick.view(np.float64)[TUNED]
         self._command_views = tuple(self._views[f"command_{name}"] for name in _COMMAND_FIELDS)
 
     @property
@@ -120,11 +123,37 @@ class Cycle:
         """What the guard says of the last measurement; empty when all is in order."""
         return "" if self._verdict is _OK else self.guard.explain(self._verdict, self.tick)
 
-    def swap_policy(self, policy: Policy) -> None:
-        """Take another policy, between two ticks."""
-        self.controller.policy = policy
+    def swap_policy(self, policy: Policy, share: float = 1.0) -> None:
+        """Take another policy, between two ticks; below a ``share`` of one the policy before has the rest.
+
+        Two that differ in kind have nothing between them: there the command is blended, as between two modes.
+        """
+        kin = alike(self.controller.policy, policy)
+        if share < 1.0 and kin:
+            self.outgoing = self.generation
+            self.controller.hand_over(policy)
+            self.controller.share = share
+        else:
+            self.outgoing = 0
+            self.controller.policy = policy
+        if not kin:
+            self.controller.state["remembered"] = 0
+            if self.state.mode is _STAND or self.state.mode is _WALK:
+                self._blend_from, self._blend_left = self._command, self.config.posture.blend_time
         self.generation += 1
         self.note("policy", f"{policy.name} is active")
+
+    def share_policy(self, share: float) -> None:
+        """How much of the active policy acts from the next tick on; at one the outgoing policy is gone."""
+        self.controller.share = share
+        if share >= 1.0:
+            self.outgoing = 0
+
+    def tune(self, values: Array) -> None:
+        """Put a recorded row of tuned numbers in force, shape (TUNING_SIZE,), between two ticks."""
+        self.controller.tuning[1:] = values[1:]
+        if values[0] != self.controller.tuning[0]:
+            self.share_policy(float(values[0]))
 
     def warm_up(self, measurement: Measurement) -> None:
         """Run every path of a tick once, so that nothing compiles later; leaves the state as it was."""
@@ -218,7 +247,8 @@ class Cycle:
             Mode(int(k["mode"])), bool(k["armed"]), Reason(int(k["reason"])), Reason(int(k["fault"]))
         )
         self._verdict = Reason(int(k["verdict"]))
-        self.generation = int(self._row["policy"])
+        self.generation, self.outgoing = int(self._row["policy"]), int(self._row["outgoing"])
+        self.tune(self._tuned)
         self.posture.recall(k["posture"])
 
     def note(self, kind: str, text: str) -> None:
@@ -230,7 +260,8 @@ class Cycle:
         row = self._row
         row["index"], row["stamp"], row["period"] = wake.index, wake.stamp, wake.elapsed
         row["lateness"], row["overruns"], row["policy"] = wake.lateness, wake.overruns, self.generation
-        row["clamps"] = 0
+        row["clamps"], row["outgoing"] = 0, self.outgoing
+        self._tuned[:] = self.controller.tuning
 
     def _note_measurement(self, measurement: Measurement) -> None:
         row, views = self._row, self._views

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import logging
 import signal
 import time
@@ -18,20 +17,35 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.durable import write_whole
 from drivers.errors import BusTimeout, CorruptFrame, DriverError
 from drivers.robot import Measurement, Robot, damp_command
 from runtime import policies, realtime, state
+from runtime.audition import Answer, Audition
 from runtime.config import Config
-from runtime.control.policy import Policy, encode_policy
-from runtime.control.records import Clamp, SolverStatus, VelocityCommand
+from runtime.control.policy import Policy
+from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle, Wake
+from runtime.doors import Channel, Outcome
 from runtime.flight_log import FlightLog
-from runtime.link import Channel, Link
-from runtime.messages import Keys, Mode, ModeReply, Request, Status
+from runtime.link import Link
+from runtime.messages import (
+    Keys,
+    Mode,
+    ModeReply,
+    PolicyEntry,
+    PoseMessage,
+    Request,
+    Status,
+    TuningEntry,
+    TuningReply,
+    TuningRequest,
+)
 from runtime.modes import Reason
+from runtime.shelf import PolicyFile, Shelf
+from runtime.status import build_status
 from runtime.systemd import Notifier
 from runtime.ticker import Ticker
+from runtime.tuning import Tuning, TuningError
 
 log = logging.getLogger("trotd")
 
@@ -54,6 +68,8 @@ class Job:
     """Keys that belong to this body alone."""
     ready: Callable[[], None] = field(default=lambda: None)
     """Called once, after the first tick."""
+    simulated: bool = False
+    """The body is none that could break."""
     memory: Path | None = None
     """Where the ring of ticks lies: a folder that is kept in RAM spares the disk. Without one, the state folder."""
 
@@ -70,10 +86,9 @@ class Daemon:
         name = job.config.robot.name
         memory = (job.memory or job.folder / "memory") / name
         self.flight = FlightLog(job.config, job.robot_toml, job.folder / "recordings" / name, memory, self.cycle)
-        self._policy_bytes = encode_policy(job.policy)
-        self._policy_before: bytes | None = None
-        self.flight.take_policy(self.cycle.generation, self._policy_bytes)
-        self._policy_file = job.folder / "policies" / f"{name}.json"
+        self.shelf = Shelf(self.cycle, job.folder, name, self.flight.take_policy)
+        self.audition = Audition(self.cycle, self.shelf, job.config.audition)
+        self.tuning = Tuning(job.config, self.cycle.controller.tuning, job.folder / "tuning" / f"{name}.json")
         self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
         self._stop: asyncio.Event | None = None
         self._held = False
@@ -104,9 +119,12 @@ class Daemon:
         body = self.job.body
         try:
             await body.connect()
-            self._load_kept_policy()
+            if problem := self.shelf.load_kept():
+                self.cycle.note("policy", problem)
+            self.tuning.load(lambda words: self.cycle.note("tuning", words))
             self.measurement = await body.exchange(damp_command(self.config.damp.kd))
             self.cycle.warm_up(self.measurement)
+            self.audition.warm_up()
             yield
         finally:
             try:
@@ -117,16 +135,7 @@ class Daemon:
     @contextlib.asynccontextmanager
     async def _linked(self) -> AsyncIterator[None]:
         keys = Keys(self.config.robot.name)
-        config = self.config
-        self.link = Link(
-            config.link,
-            config.control.bounds,
-            config.robot.name,
-            config.control.rate_hz,
-            self,
-            self.flight.folder,
-            self.job.channels(keys),
-        )
+        self.link = Link(self.config, self, self.flight.folder, self.job.channels(keys))
         try:
             self.link.open()
             yield
@@ -178,6 +187,7 @@ class Daemon:
         """The loop: one exchange and one step of the cycle a tick."""
         assert self._stop is not None
         stop, cycle, body, flight, link = self._stop, self.cycle, self.job.body, self.flight, self.link
+        audition, tuning = self.audition, self.tuning
         feed_every = max(1, round(notifier.watchdog_period * self.config.control.rate_hz))
         fed = 0
         command = damp_command(self.config.damp.kd)
@@ -197,6 +207,9 @@ class Daemon:
                 self._compute[flight.recorder.count % len(self._compute)] = compute
                 flight.keep()
                 link.offer(cycle.tick)
+                tuning.step(cycle.state.mode)
+                if audition.stage is not None:
+                    audition.step()
                 if flight.recorder.count == 1:
                     self.job.ready()
                     notifier.tell("READY=1")
@@ -227,6 +240,7 @@ class Daemon:
     def _finish(self) -> None:
         """The loop is over: say so, keep the recording."""
         self.cycle.damp(Reason.STOPPING)
+        self.audition.stop()
         self._tell_events()
         self.flight.finish()
         self._tell_events()
@@ -248,19 +262,7 @@ class Daemon:
             self._held = hold
             realtime.hold_garbage(hold)
 
-    def _load_kept_policy(self) -> None:
-        """The last policy that was sent and accepted, if it still can be used."""
-        if not self._policy_file.is_file():
-            return
-        try:
-            data = self._policy_file.read_bytes()
-            policy = policies.decode(data, self.config.robot.name, str(self._policy_file))
-        except (OSError, policies.PolicyError) as error:
-            self.cycle.note("policy", f"kept policy not used: {error}")
-            return
-        self.take_policy(policy, data)
-
-    # Doors (on the loop's thread, but for keep_policy) -------------------------------------------------------------
+    # Doors (on the loop's thread) -------------------------------------------------------------
 
     def take_velocity(self, command: VelocityCommand) -> None:
         """The newest command of the operator."""
@@ -278,29 +280,66 @@ class Daemon:
             self.cycle.note("mode", "the operator is gone")
             self.take_request(Request.STAND)
 
-    def take_policy(self, policy: Policy, data: bytes) -> None:
-        """Make a verified policy the active one."""
-        self.cycle.swap_policy(policy)
-        self._policy_before, self._policy_bytes = self._policy_bytes, data
-        self.flight.take_policy(self.cycle.generation, data)
-
-    def keep_policy(self, data: bytes) -> None:
-        """Remember a policy for the next start. On zenoh's thread: it waits for the disk."""
-        write_whole(self._policy_file, data)
-
-    def previous_policy(self) -> bytes:
-        """The file of the policy that was active before this one.
+    def offer_policy(self, file: PolicyFile, immediate: bool, done: Future[Outcome]) -> None:
+        """A verified candidate; ``done`` gets what became of it, which may take seconds.
 
         Raises:
-            PolicyError: there was none since the start.
+            PolicyError: not now, or not on this body.
         """
-        if self._policy_before is None:
-            raise policies.PolicyError("no policy was active before this one")
-        return self._policy_before
+        if immediate and not self.job.simulated:
+            raise policies.PolicyError("immediate is for simulated bodies: a robot shadows first")
+        self.audition.offer(file, immediate, _settle(done))
 
-    def active_policy(self) -> tuple[str, bytes]:
-        """Name and file of the active policy."""
-        return self.cycle.policy.name, self._policy_bytes
+    def roll_back(self, done: Future[Outcome]) -> None:
+        """Return to the last good policy.
+
+        Raises:
+            PolicyError: there is none, or not now.
+        """
+        self.audition.roll_back(_settle(done))
+
+    def active_policy(self) -> PolicyFile:
+        """The active policy and its file."""
+        return self.shelf.active
+
+    def list_policies(self) -> Callable[[], list[PolicyEntry]]:
+        """What is known now, with what else a look at the disk finds; the look is for another thread."""
+        known = self.shelf.entries()
+        return lambda: known + self.shelf.on_disk()
+
+    def take_pose(self, pose: PoseMessage) -> None:
+        """The body pose that the operator's sticks ask for.
+
+        Raises:
+            TuningError: not standing, or out of reach.
+        """
+        self.tuning.pose(pose)
+
+    def take_tuning(self, change: TuningRequest, done: Future[TuningReply]) -> None:
+        """Change what may be changed; a saved value is on the disk before the answer."""
+        try:
+            value = self.tuning.change(change.name, change.value)
+        except TuningError as error:
+            done.set_result(TuningReply(False, str(error)))
+            return
+        self.cycle.note("tuning", f"{change.name} = {value}")
+        if not change.save:
+            done.set_result(TuningReply(True, f"{change.name} = {value}"))
+            return
+        saving = asyncio.get_running_loop().run_in_executor(
+            None, self.tuning.save, change.name, None if change.value is None else value
+        )
+
+        def saved(written: asyncio.Future[None]) -> None:
+            error = None if written.cancelled() else written.exception()
+            words = f"{change.name} = {value}, " + ("saved" if error is None else f"not saved: {error}")
+            done.set_result(TuningReply(error is None, words))
+
+        saving.add_done_callback(saved)
+
+    def list_tuning(self) -> list[TuningEntry]:
+        """Everything that may be changed."""
+        return self.tuning.entries()
 
     def refuse(self, door: str, why: str) -> None:
         """A message that did not come through a door."""
@@ -312,38 +351,13 @@ class Daemon:
 
     def status(self) -> Status:
         """Everything that people want to see."""
-        cycle = self.cycle
-        tick, current = cycle.tick[0], cycle.state
-        seen = self._compute[: min(len(self._compute), max(1, self.flight.recorder.count))]
-        p50, p99 = np.percentile(seen, (50, 99))
-        return Status(
-            robot=self.config.robot.name,
-            mode=current.mode.name,
-            armed=current.armed,
-            fault="" if current.fault is Reason.OK else current.fault.words,
-            health=cycle.health,
-            reason=current.reason.words,
-            policy=f"{cycle.policy.name} {hashlib.sha256(self._policy_bytes).hexdigest()[:12]}",
-            rate_hz=self.config.control.rate_hz,
-            ticks=int(tick["index"]),
-            overruns=int(tick["overruns"]),
-            velocity_command=_triple(tick["asked_velocity"]),
-            velocity=_triple(tick["twist"][[0, 1, 5]]),
-            height=float(tick["height"]),
-            rpy=_triple(tick["rpy"]),
-            voltage=float(tick["voltage"]),
-            max_temperature=float(tick["joint_temperature"].max()),
-            tick_p50=float(p50),
-            tick_p99=float(p99),
-            clamps={str(clamp.name): int(n) for clamp, n in zip(Clamp, cycle.clamps, strict=True) if n},
-            solver={status.name: int(n) for status, n in zip(SolverStatus, cycle.solver, strict=True) if n},
-            recordings_refused=dict(self.flight.refused),
-        )
+        compute = self._compute[: min(len(self._compute), max(1, self.flight.recorder.count))]
+        refused = self.link.entrance.refused
+        return build_status(self.cycle, self.shelf.active, compute, refused, self.flight.refused)
 
 
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
+def _settle(done: Future[Outcome]) -> Answer:
+    return lambda verdict: done.set_result(Outcome(verdict.accepted, verdict.words, verdict.report))
 
 
 def main(job: Job) -> Daemon:

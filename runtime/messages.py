@@ -12,7 +12,8 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from runtime.control.records import CONTROL_DTYPE, Clamp, SolverStatus, VelocityCommand
+from runtime.control.records import CONTROL_DTYPE, Clamp, Fields, SolverStatus, VelocityCommand
+from runtime.control.state import TUNING_FIELDS, TUNING_SIZE
 
 __all__ = [
     "CONTROL_DTYPE",
@@ -21,6 +22,8 @@ __all__ = [
     "Event",
     "Keys",
     "Mode",
+    "PolicyEntry",
+    "PoseMessage",
     "ModeReply",
     "MessageError",
     "PolicyReply",
@@ -32,11 +35,16 @@ __all__ = [
     "SimTruth",
     "SolverStatus",
     "Status",
+    "TuningEntry",
+    "TuningReply",
+    "TuningRequest",
     "VelocityCommand",
     "VelocityMessage",
     "decode_hold",
+    "decode_pose",
     "decode_push",
     "decode_request",
+    "decode_tuning",
     "decode_velocity",
     "tick_schema",
 ]
@@ -63,6 +71,7 @@ class Request(StrEnum):
     CLEAR = "clear"
 
 
+TUNED_FIELDS: Fields = [(name if name == "policy_share" else f"tuned_{name}", *kind) for name, *kind in TUNING_FIELDS]
 TICK_DTYPE = np.dtype(
     [
         ("index", "u8"),  # tick number since the daemon started
@@ -75,6 +84,8 @@ TICK_DTYPE = np.dtype(
         ("armed", "u1"),
         ("reason", "u2"),  # why the mode is what it is (runtime.modes.Reason)
         ("policy", "u4"),  # generation of the active policy, counted from 1 at start
+        ("outgoing", "u4"),  # generation of the policy that it is blended in over, while its share is below one
+        *TUNED_FIELDS,  # what the operator may change, as in force in this tick
         ("asked_velocity", "f8", (3,)),  # newest operator command: vx, vy m/s, yaw rate rad/s
         ("measured_stamp", "f8"),  # s, the body's own clock (the simulator's is simulated time)
         ("imu_stamp", "f8"),
@@ -94,6 +105,8 @@ TICK_DTYPE = np.dtype(
 )
 """One tick, whole. The core's part (``CONTROL_DTYPE``) is its tail."""
 
+TUNED = slice(TICK_DTYPE.fields["policy_share"][1] // 8, TICK_DTYPE.fields["policy_share"][1] // 8 + TUNING_SIZE)  # type: ignore[index]
+"""Where the tuned numbers lie in a tick seen as float64: the same row as ``Controller.tuning``."""
 CONTROL_OFFSET = TICK_DTYPE.itemsize - CONTROL_DTYPE.itemsize
 """Where the core's part starts inside a tick record, bytes."""
 
@@ -130,6 +143,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """How often each solver status came since the start."""
     recordings_refused: dict[str, int] = {}
     """How often the flight recorder could not write, by the reason."""
+    refused: dict[str, int] = {}
+    """How many messages were refused or shed since the start, by key."""
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):
@@ -166,6 +181,62 @@ class PolicyReply(msgspec.Struct, frozen=True):
     sha256: str
     """Of the active policy's file."""
     reason: str
+    report: dict[str, float] = {}
+    """What the shadow found: root mean squares of the differences, shares of ticks; empty without one."""
+
+
+class PolicyEntry(msgspec.Struct, frozen=True):
+    """One row of the list that ``policies`` answers with."""
+
+    role: str
+    """``active``, ``previous`` (what a rollback takes), ``good``, ``kept`` (for the next start) or ``shipped``."""
+    name: str
+    sha256: str
+    """Of the file."""
+    made: str
+    """From what and how, as its provenance says."""
+
+
+class TuningRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """JSON on ``command/tuning``."""
+
+    name: str
+    value: float | str | None
+    """A number, a gait's name, or nothing for the robot's own."""
+    save: bool = False
+    """For the next start too."""
+
+
+class TuningReply(msgspec.Struct, frozen=True):
+    """JSON reply to it."""
+
+    accepted: bool
+    reason: str
+
+
+class TuningEntry(msgspec.Struct, frozen=True):
+    """One row of the list that ``tuning`` answers with."""
+
+    name: str
+    unit: str
+    value: float | str
+    """In force."""
+    wanted: float | str
+    """What the value moves to."""
+    own: float | str
+    """What the robot's TOML says."""
+    low: float | None
+    high: float | None
+    saved: float | str | None
+
+
+class PoseMessage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """JSON on ``command/pose``: the body's pose while standing, as shares of its bounds, -1 to 1."""
+
+    roll: float
+    pitch: float
+    yaw: float
+    height: float
 
 
 class RecordingEntry(msgspec.Struct, frozen=True):
@@ -302,6 +373,27 @@ def decode_hold(data: bytes) -> SimHold:
     return message
 
 
+def decode_tuning(data: bytes) -> TuningRequest:
+    """What a query on ``command/tuning`` carries.
+
+    Raises:
+        MessageError: not JSON or not these keys.
+    """
+    return _decode(data, TuningRequest)
+
+
+def decode_pose(data: bytes) -> PoseMessage:
+    """What ``command/pose`` carries.
+
+    Raises:
+        MessageError: not JSON, not these keys, or beyond ±1.
+    """
+    message = _decode(data, PoseMessage)
+    for name in PoseMessage.__struct_fields__:
+        _within(name, getattr(message, name), 1.0)
+    return message
+
+
 class Keys:
     """The key expressions of one robot."""
 
@@ -315,6 +407,10 @@ class Keys:
         self.velocity = f"{root}/command/velocity"
         self.mode = f"{root}/command/mode"
         self.policy = f"{root}/policy"
+        self.policies = f"{root}/policies"
+        self.tuning = f"{root}/tuning"
+        self.change_tuning = f"{root}/command/tuning"
+        self.pose = f"{root}/command/pose"
         self.recording = f"{root}/recording"
         self.alive = f"{root}/alive"
         self.operator = f"{root}/operator"

@@ -13,6 +13,7 @@ from drivers.description import NonNegative, Positive, Record
 
 Angle = Annotated[float, Meta(gt=0, le=3.2)]
 Endpoint = Annotated[str, Meta(pattern=r"^[a-z]+/[^\s/]+$")]
+Share = Annotated[float, Meta(ge=0, le=1)]
 Celsius = Annotated[float, Meta(ge=0, le=200)]
 
 
@@ -92,6 +93,69 @@ class LinkConfig(Record, frozen=True, kw_only=True):
     batch: Annotated[int, Meta(ge=1, le=100)] = 5
     """Tick records in one message."""
     status_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
+
+
+class AuditionConfig(Record, frozen=True, kw_only=True):
+    """How a policy that is sent while the daemon runs becomes the active one, and when it does not."""
+
+    shadow: NonNegative = 2.0
+    """It runs beside the active one for so long, s."""
+    wait: Positive = 2.0
+    """How long it then waits for a moment with enough legs on the ground, s."""
+    blend: Positive = 0.5
+    """Its share grows from none to all over this time, s."""
+    trial: Positive = 3.0
+    """It is watched for so long while it stands, and for so long while it walks; after that it is kept, s."""
+    return_time: Positive = 0.05
+    """The policy before gets its share back over this time, s."""
+    window: Positive = 0.2
+    """Low-pass of the two shares of ticks that are watched, s."""
+    max_norm: Positive = 10.0
+    """An action with every scaled observation at one, as a multiple of the action's bound."""
+    tilt_ahead: NonNegative = 0.1
+    """The tilt that is watched is the one foreseen for so much later, from the body's rates, s."""
+    tilt_rise: Angle = 0.08
+    """Beyond the largest such tilt under the policy before, rad."""
+    height_rise: Positive = 0.06
+    """Beyond the largest error of the height under the policy before, m."""
+    clamp_rise: Share = 0.3
+    """Share of ticks with a clamp, beyond the policy before; in shadow and on trial."""
+    fallback_rise: Share = 0.2
+    """Share of ticks that the first solver did not solve, beyond the policy before."""
+    min_agreement: Annotated[float, Meta(ge=-1, le=1)] = 0.0
+    """Cosine of the two wrenches in shadow; below it, the candidate asks for the opposite of the active policy."""
+
+
+Bounds = tuple[float, float]
+
+
+class TuningConfig(Record, frozen=True, kw_only=True):
+    """Between which bounds an operator may change what while the robot lives, and how fast it follows."""
+
+    swing_time: Bounds = (0.1, 0.5)
+    """s."""
+    stance_time: Bounds = (0.1, 1.0)
+    """s."""
+    swing_height: Bounds = (0.02, 0.15)
+    """m."""
+    walking_height: Bounds = (0.75, 1.08)
+    """As a share of the robot's own; the legs' reach is looked at besides."""
+    kp: Bounds = (0.25, 1.5)
+    """As a share of the robot's own."""
+    kd: Bounds = (0.25, 2.0)
+    """The same."""
+    gain_scale: Bounds = (0.05, 1.0)
+    """Of both scales of the gains in stance."""
+    roll: Angle = 0.3
+    """Body pose while standing, to either side, rad."""
+    pitch: Angle = 0.25
+    """rad."""
+    yaw: Angle = 0.35
+    """rad."""
+    height: Bounds = (-0.25, 0.06)
+    """As a share of the robot's walking height."""
+    ramp_time: Positive = 1.0
+    """From one bound to the other, s."""
 
 
 class RecorderConfig(Record, frozen=True, kw_only=True):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from itertools import chain
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from drivers.description import UNDECODABLE
+from drivers.robot import Array
 from runtime.control.observation import OBSERVATION_NAMES
 from runtime.control.policy import GRF_NAMES, SHIFT_NAMES, WRENCH_NAMES, Policy
 from runtime.control.state import HIDDEN
@@ -110,6 +113,39 @@ def verify(policy: Policy, robot: str, place: str) -> None:
             raise PolicyError(f"{place}: hidden: {len(policy.hidden)} units; at most {HIDDEN}")
         _shape("hidden", policy.hidden, len(policy.hidden), 28, place)
         _shape("readout", policy.readout, len(actions), len(policy.hidden), place)
+
+
+def layout_hash(output: str) -> str:
+    """Digest of what a policy with this output sees and answers in this version, in order. 16 hex digits."""
+    actions = SHIFT_NAMES + (WRENCH_NAMES if output == "wrench" else GRF_NAMES)
+    return hashlib.sha256("\n".join((*OBSERVATION_NAMES, "", *actions)).encode()).hexdigest()[:16]
+
+
+def check_manifest(policy: Policy, rate_hz: float, max_norm: float, place: str) -> None:
+    """What a verified policy must fulfil besides, to be sent to a running robot: rate, layout and size of its gains.
+
+    Raises:
+        PolicyError: naming the value and the bound.
+    """
+    if policy.rate_hz and policy.rate_hz != rate_hz:
+        raise PolicyError(f"{place}: rate_hz = {policy.rate_hz:g}: this robot ticks at {rate_hz:g}")
+    if policy.layout and policy.layout != (layout := layout_hash(policy.output)):
+        raise PolicyError(f"{place}: layout = {policy.layout!r}: this version has {layout!r}")
+    norms = action_norms(policy)
+    worst = int(norms.argmax())
+    if norms[worst] > max_norm:
+        name = policy.action_names[worst]
+        raise PolicyError(f"{place}: {name} reaches {norms[worst]:.3g} times its bound, audition.max_norm {max_norm:g}")
+
+
+def action_norms(policy: Policy) -> Array:
+    """Each action with every scaled observation at one, against it, as a multiple of its bound."""
+    if policy.matrix:
+        reach = np.abs(np.array(policy.matrix)).sum(axis=1)
+    else:  # a hidden unit gives one at most
+        reach = np.abs(np.array(policy.readout)).sum(axis=1)
+    norms: Array = reach * np.abs(policy.action_scale) / np.array(policy.action_bound)
+    return norms
 
 
 def _same_names(key: str, names: tuple[str, ...], wanted: tuple[str, ...], place: str) -> None:

@@ -18,7 +18,7 @@ from runtime import config, policies
 from runtime.control.policy import Policy
 from runtime.control.records import COMMAND_FIELDS, ESTIMATE_FIELDS, FEET_FIELDS, Clamp, Records, VelocityCommand
 from runtime.cycle import KEYFRAME_DTYPE, Cycle, Wake
-from runtime.messages import TICK_DTYPE, Mode, Request
+from runtime.messages import TICK_DTYPE, TUNED, Mode, Request
 from runtime.modes import Reason
 from runtime.recording import Recording, RecordingError
 
@@ -93,7 +93,10 @@ class Player:
         self._decoded: dict[int, Policy] = {}
         keyframe, self.first = self._find_keyframe()
         start = self._ticks[self.first : self.first + 1]
-        self.cycle = Cycle(self.config, self._policy(int(start["policy"][0])))
+        active, outgoing = int(start["policy"][0]), int(start["outgoing"][0])
+        self.cycle = Cycle(self.config, self._policy(outgoing or active))
+        if outgoing:
+            self.cycle.swap_policy(self._policy(active), float(start["policy_share"][0]))
         self.cycle.recall(keyframe, start)
         self._measurement = measurement_of(start[0])
 
@@ -146,10 +149,16 @@ class Player:
         generation = int(tick["policy"])
         if generation != self.cycle.generation:
             self.cycle.generation = generation - 1
-            self.cycle.swap_policy(self._policy(generation))
+            self.cycle.swap_policy(self._policy(generation), float(tick["policy_share"]))
+        self._tune(tick)
         if tick["mode"] == Mode.WALK or tick["reason"] == Reason.COMMAND_LOST:
             velocity = tick["asked_velocity"].copy()
             self.cycle.command_velocity(VelocityCommand(self._heard(tick), velocity[:2], float(velocity[2])))
+
+    def _tune(self, tick: np.void) -> None:
+        tuned = np.frombuffer(tick.tobytes(), np.float64)[TUNED]
+        if tuned.tobytes() != self.cycle.controller.tuning.tobytes():
+            self.cycle.tune(tuned)
 
     def _wishes(self, before: np.void, tick: np.void) -> Iterator[Request]:
         """The requests that made ``tick`` out of ``before``, as far as the tick itself does not."""

@@ -95,9 +95,11 @@ class Station:
             " it is another robot's endpoint, or this certificate may not ask"
         )
 
-    def ask_for(self, kind: type[Answer], key: str, payload: bytes | None = None, parameters: str = "") -> Answer:
+    def ask_for(
+        self, kind: type[Answer], key: str, payload: bytes | None = None, parameters: str = "", timeout: float = 5.0
+    ) -> Answer:
         """``ask``, with the JSON reply decoded to ``kind``."""
-        data = self.ask(key, payload, parameters)
+        data = self.ask(key, payload, parameters, timeout)
         try:
             return msgspec.json.decode(data, type=kind)
         except msgspec.MsgspecError as error:

@@ -5,7 +5,8 @@ What arrives faster than it is drawn is dropped here, oldest first, and counted 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any
 
@@ -119,3 +120,18 @@ class TickStream:
     def _payloads(subscriber: Any) -> Iterator[bytes]:
         while (sample := subscriber.handler.try_recv()) is not None:
             yield sample.payload.to_bytes()
+
+
+@contextlib.contextmanager
+def hearing(station: Station, tell: Callable[[Event], None]) -> Iterator[None]:
+    """Have ``tell`` called with every event of the robot, on one of zenoh's threads."""
+
+    def hear(sample: zenoh.Sample) -> None:
+        with contextlib.suppress(msgspec.MsgspecError):
+            tell(msgspec.json.decode(sample.payload.to_bytes(), type=Event))
+
+    subscriber: Any = station.session.declare_subscriber(station.keys.event, hear)
+    try:
+        yield
+    finally:
+        subscriber.undeclare()

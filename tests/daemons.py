@@ -36,6 +36,9 @@ QUICK = {
     "posture.blend_time": 0.02,
     "damp.deadline": 0.3,
     "recorder.seconds": 2.0,
+    "audition.shadow": 0.1,
+    "audition.blend": 0.05,
+    "audition.trial": 0.2,
     "recorder.after_fault": 0.02,
 }
 
@@ -92,12 +95,13 @@ class Served:
         body: Any = None,
         channels: Any = lambda _keys: (),
         memory: Path | None = None,
+        simulated: bool = True,
     ) -> None:
         self.config = made
         self.body = body or Probe(made)
         self.ready = asyncio.Event()
         policy = make_policy(made.robot.name)
-        job = Job(made, "# test", policy, self.body, folder, channels, lambda: self.ready.set(), memory)
+        job = Job(made, "# test", policy, self.body, folder, channels, lambda: self.ready.set(), simulated, memory)
         self.daemon = Daemon(job)
 
     async def __aenter__(self) -> Served:
@@ -135,6 +139,11 @@ class Served:
         for wish in (Request.ARM, Request.STAND):
             assert self.daemon.take_request(wish).accepted
         await self.reach(Mode.STAND)
+
+    async def until(self, fact: Callable[[], bool]) -> None:
+        async with asyncio.timeout(20):
+            while not fact():  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
 
     async def walk(self) -> None:
         await self.stand()

@@ -252,15 +252,22 @@ def test_a_policy_survives_a_restart_and_a_spoilt_one_is_left(tmp_path: Path) ->
         )
         assert reply.accepted
 
+    async def prove(served: Served) -> None:
+        await send(served)
+        await served.walk()
+        await served.until(lambda: served.daemon.audition.stage is None)
+
     async def look(served: Served) -> None:
         names.append(served.daemon.cycle.policy.name)
 
     names: list[str] = []
     serve(tmp_path, send, made)
     serve(tmp_path, look, made)
+    serve(tmp_path, prove, made)
+    serve(tmp_path, look, made)
     (tmp_path / "policies" / f"{made.robot.name}.json").write_bytes(b'{"format": 1')
     serve(tmp_path, look, made)
-    assert names == ["candidate", "balance"]
+    assert names == ["balance", "candidate", "balance"], "only what has walked is kept"
 
 
 def test_two_daemons_for_one_robot(tmp_path: Path) -> None:

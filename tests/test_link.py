@@ -18,20 +18,28 @@ import zenoh
 from daemons import free_endpoint, make_config, make_policy
 
 from runtime.config import Config
-from runtime.control.policy import Policy, encode_policy
+from runtime.control.policy import encode_policy
 from runtime.control.records import VelocityCommand
-from runtime.link import Channel, Link, LinkError
+from runtime.doors import Channel, Outcome
+from runtime.link import Link, LinkError
 from runtime.messages import (
     TICK_DTYPE,
     Event,
     MessageError,
     ModeReply,
+    PolicyEntry,
     PolicyReply,
+    PoseMessage,
     RecordingEntry,
     RecordingReply,
     Request,
     Status,
+    TuningEntry,
+    TuningReply,
+    TuningRequest,
 )
+from runtime.policies import PolicyError
+from runtime.shelf import PolicyFile
 from station.session import Station, StationError, connected
 
 STATUS = Status(
@@ -49,10 +57,10 @@ class Desk:
         self.requests: list[Request] = []
         self.refused: list[tuple[str, str]] = []
         self.threads: set[int] = set()
-        self.kept: bytes = b""
         self.lost = 0
-        self.policy = make_policy(robot)
-        self.data = encode_policy(self.policy)
+        self.poses: list[PoseMessage] = []
+        policy = make_policy(robot)
+        self.file = PolicyFile(policy, encode_policy(policy))
 
     def _note(self) -> None:
         self.threads.add(threading.get_ident())
@@ -70,20 +78,38 @@ class Desk:
         self._note()
         self.lost += 1
 
-    def take_policy(self, policy: Policy, data: bytes) -> None:
+    def take_pose(self, pose: PoseMessage) -> None:
         self._note()
-        self.policy, self.data = policy, data
+        self.poses.append(pose)
 
-    def keep_policy(self, data: bytes) -> None:
-        self.kept = data
+    def take_tuning(self, change: TuningRequest, done: Future[TuningReply]) -> None:
+        self._note()
+        done.set_result(TuningReply(change.name == "swing_time", change.name))
+
+    def list_tuning(self) -> list[TuningEntry]:
+        self._note()
+        return [TuningEntry("swing_time", "s", 0.2, 0.2, 0.2, 0.1, 0.5, None)]
+
+    def offer_policy(self, file: PolicyFile, immediate: bool, done: Future[Outcome]) -> None:
+        self._note()
+        self.file = file
+        asyncio.get_running_loop().call_later(0.05, done.set_result, Outcome(True, f"immediate: {immediate}", {"a": 1}))
+
+    def roll_back(self, done: Future[Outcome]) -> None:
+        self._note()
+        raise PolicyError("nothing before")
+
+    def list_policies(self) -> Callable[[], list[PolicyEntry]]:
+        self._note()
+        return lambda: [PolicyEntry("active", "p", "0", "by hand")]
 
     def refuse(self, door: str, why: str) -> None:
         self._note()
         self.refused.append((door, why))
 
-    def active_policy(self) -> tuple[str, bytes]:
+    def active_policy(self) -> PolicyFile:
         self._note()
-        return self.policy.name, self.data
+        return self.file
 
     def record_now(self, reason: str, done: Future[Path]) -> None:
         self._note()
@@ -101,10 +127,7 @@ class Open:
         self.config: Config = make_config()
         self.desk = Desk(self.config.robot.name)
         self.link = Link(
-            self.config.link,
-            self.config.control.bounds,
-            self.config.robot.name,
-            200.0,
+            self.config,
             self.desk,
             tmp_path,
             [Channel(f"trotd/{self.config.robot.name}/{c.key}", c.produce, c.accept) for c in channels],
@@ -190,8 +213,8 @@ def test_a_policy_is_fetched_swapped_kept_and_a_bad_one_refused(opened: Open) ->
 
     active, good, bad = opened.run(act)
     assert active == encode_policy(make_policy(name))
-    assert good.accepted and good.name == "candidate"
-    assert opened.desk.kept == candidate == opened.desk.data
+    assert good.accepted and good.name == "candidate" and good.reason == "immediate: False" and good.report == {"a": 1}
+    assert opened.desk.file.data == candidate
     for reply in bad:
         assert not reply.accepted and reply.reason and reply.name == "candidate"
     assert "this robot is" in bad[2].reason

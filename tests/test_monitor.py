@@ -36,7 +36,12 @@ def status(**changes: Any) -> Status:
     }
     triples = dict.fromkeys(("velocity_command", "velocity", "rpy"), (0.0, 0.0, 0.0))
     return msgspec.convert(
-        values | triples | {"armed": True, "policy": "", "rate_hz": 200.0, "clamps": {}, "solver": {}} | changes, Status
+        values
+        | triples
+        | {"armed": True, "policy": "", "rate_hz": 200.0, "clamps": {}, "solver": {}}
+        | {"recordings_refused": {}, "refused": {}}
+        | changes,
+        Status,
     )
 
 

@@ -51,7 +51,7 @@ WIDE = {"shift": 1e6, "force": [1e6] * 3, "moment": [1e6] * 3}
 def play(chosen: Policy, observation: np.ndarray = OBSERVATION, bounds: dict[str, Any] | None = None) -> Workbench:
     bench = Workbench(chosen=chosen, bounds=bounds or WIDE)
     bench.t.observation = observation
-    act(bench.p, bench.chosen, bench.s, bench.t)
+    act(bench.p, bench.chosen, bench.chosen, bench.s, bench.t)
     return bench
 
 
@@ -103,10 +103,10 @@ def test_the_tighter_bound_of_policy_and_robot_holds(tighter: str) -> None:
 def test_what_is_asked_and_is_no_number_is_told_and_never_bounded_into_one(value: float, place: int) -> None:
     bench = Workbench(chosen=linear(), bounds=WIDE)
     bench.t.observation = OBSERVATION
-    assert act(bench.p, bench.chosen, bench.s, bench.t)
+    assert act(bench.p, bench.chosen, bench.chosen, bench.s, bench.t)
     before = bench.t.action.copy()
     bench.chosen["matrix"][3, place] = value
-    assert not act(bench.p, bench.chosen, bench.s, bench.t)
+    assert not act(bench.p, bench.chosen, bench.chosen, bench.s, bench.t)
     np.testing.assert_array_equal(bench.t.action, before)
 
 
@@ -116,20 +116,20 @@ def test_shifts_follow_with_their_time_constant_and_do_not_wind_up() -> None:
     bench.t.observation = OBSERVATION
     dt, wanted = float(bench.p.dt), SCALE[:12] * (MATRIX[:12] @ OBSERVATION)
     for tick in range(1, 200):
-        act(bench.p, bench.chosen, bench.s, bench.t)
+        act(bench.p, bench.chosen, bench.chosen, bench.s, bench.t)
         free = wanted * (1 - (0.05 / (0.05 + dt)) ** tick)
         within = np.abs(wanted) < 0.5
         np.testing.assert_allclose(bench.t.action[:12][within], free[within], rtol=1e-9)
     assert np.abs(bench.t.action[:12]).max() == 0.5
     bench.t.observation = -OBSERVATION
-    act(bench.p, bench.chosen, bench.s, bench.t)
+    act(bench.p, bench.chosen, bench.chosen, bench.s, bench.t)
     assert (np.abs(bench.t.action[:12]) < 0.5).all(), "leaves its bound at once"
 
 
 def test_capture_point_moves_every_touchdown_by_the_velocity_error() -> None:
     bench = Workbench(chosen=linear(matrix=rows(np.zeros((18, 28))), terms=Terms(capture_point=0.13)), bounds=WIDE)
     bench.t.twist, bench.t.velocity_command = (0.5, -0.2, 0, 0, 0, 0), (0.3, 0.1, 0.7)
-    act(bench.p, bench.chosen, bench.s, bench.t)
+    act(bench.p, bench.chosen, bench.chosen, bench.s, bench.t)
     expected = np.tile([0.13 * 0.2, 0.13 * -0.3, 0.0], 4)
     np.testing.assert_allclose(bench.t.action[:12], expected, atol=1e-15)
     assert not bench.t.action[12:].any()
@@ -140,7 +140,7 @@ def test_a_networks_leftovers_do_not_reach_the_next_policy() -> None:
     bench = Workbench(chosen=first, bounds=WIDE)
     bench.policies[:] = policy_record(linear())
     bench.t.observation = OBSERVATION
-    act(bench.p, bench.chosen, bench.s, bench.t)
+    act(bench.p, bench.chosen, bench.chosen, bench.s, bench.t)
     np.testing.assert_allclose(bench.t.asked, SCALE * (MATRIX @ OBSERVATION), rtol=1e-12)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.robot import Array, Robot
 from runtime.config import Config
-from runtime.link import Channel
+from runtime.doors import Channel
 from runtime.messages import Keys, SimTruth, decode_hold, decode_push
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trotd import cli_bench, cli_hardware, cli_ros2, cli_station, cli_training
+from trotd import cli_bench, cli_hardware, cli_live, cli_ros2, cli_station, cli_training
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -120,8 +120,17 @@ def run(
 
             config = with_baseline(body, lenient(config) if body == "twin" else config, place)
         part = build_body(body, config, path, place, observe)
-        memory = memory_folder(place)
-        job = daemon.Job(config, path.read_text(), chosen, part.robot, place, part.channels, _say_ready, memory)
+        job = daemon.Job(
+            config,
+            path.read_text(),
+            chosen,
+            part.robot,
+            place,
+            part.channels,
+            _say_ready,
+            simulated=body != "hardware",
+            memory=memory_folder(place),
+        )
         for written in daemon.main(job).flight.written:
             typer.echo(f"recording: {written}")
 
@@ -220,6 +229,7 @@ def clear(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOI
 
 cli_hardware.register(app)
 cli_station.register(app)
+cli_live.register(app)
 cli_ros2.register(app)
 cli_training.register(app)
 cli_bench.register(app)

@@ -254,34 +254,6 @@ def export(
             typer.echo(f"{path}: {path.stat().st_size} bytes")
 
 
-@app.command()
-def push(
-    policy: Annotated[Path | None, typer.Argument(help="A policy file.", exists=True, dir_okay=False)] = None,
-    robot: RobotOption = "stoch3",
-    connect: ConnectOption = ENDPOINT,
-    rollback: Annotated[bool, typer.Option("--rollback", help="Back to the policy before.")] = False,
-) -> None:
-    """Send a policy to the robot, or have it take the one before again; without either, say which is active."""
-    from runtime import config
-    from station.push import active, roll_back
-    from station.push import push as send
-    from station.session import StationError, connected
-
-    with refusals():
-        if policy is not None and rollback:
-            raise StationError("either a policy or --rollback")
-        known = config.load(config.find_robot(robot))
-        with connected(known.robot.name, connect) as station:
-            if policy is None and not rollback:
-                current, digest = active(station)
-                typer.echo(f"{current.name} {digest[:12]} is active")
-                return
-            reply = send(station, policy) if policy is not None else roll_back(station)
-        if not reply.accepted:
-            raise StationError(f"refused: {reply.reason}; {reply.name} {reply.sha256[:12]} stays active")
-        typer.echo(f"{reply.name} {reply.sha256[:12]} is active")
-
-
 keys_app = typer.Typer(no_args_is_help=True, help="Certificates: who may see, drive or teach a robot.")
 app.add_typer(keys_app, name="keys")
 AuthorityOption = Annotated[Path, typer.Option("--authority", help="Folder of the authority.", file_okay=False)]

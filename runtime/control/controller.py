@@ -14,10 +14,17 @@ from runtime.control.grf import GrfProblem, accept, aim_wrench, build_qp, cut_fo
 from runtime.control.kinematics import GEOMETRY_DTYPE, leg_geometry
 from runtime.control.observation import observe
 from runtime.control.parameters import ControlConfig
-from runtime.control.policy import Policy, act, policy_record
+from runtime.control.policy import Policy, act, mix_terms, policy_record
 from runtime.control.records import CONTROL_DTYPE, Records, SolverStatus, VelocityCommand
 from runtime.control.solvers import Ladder, make_solver
-from runtime.control.state import PARAMETERS_DTYPE, POLICY_DTYPE, STATE_DTYPE, WORK_DTYPE, build_parameters
+from runtime.control.state import (
+    PARAMETERS_DTYPE,
+    POLICY_DTYPE,
+    STATE_DTYPE,
+    TUNING_SIZE,
+    WORK_DTYPE,
+    build_parameters,
+)
 from runtime.control.torque import command_joints, damp_joints
 from runtime.control.trajectory import aim_feet
 
@@ -28,6 +35,7 @@ CORE_DTYPE = np.dtype(
         ("parameters", PARAMETERS_DTYPE),
         ("geometry", GEOMETRY_DTYPE),
         ("policy", POLICY_DTYPE),
+        ("outgoing", POLICY_DTYPE),
         ("work", WORK_DTYPE),
     ],
     align=True,
@@ -73,7 +81,7 @@ def plan(memory, record, linear, yaw_rate, standing):  # type: ignore[no-untyped
         return -1
     follow(p, policy, s, t, linear, yaw_rate, standing)
     observe(p, policy, s, t)
-    if not act(p, policy, s, t):
+    if not act(p, policy, c.outgoing, s, t):
         return -1
     advance_gait(p, s, t, standing)
     aim_feet(p, g, policy, s, t)
@@ -143,6 +151,11 @@ def _finite(out):  # type: ignore[no-untyped-def]
     return np.isfinite(position + velocity + kp + kd + torque)
 
 
+def alike(one: Policy, other: Policy) -> bool:
+    """Whether two policies see and answer the same kind of thing, so that one can be blended into the other."""
+    return one.reading == other.reading and one.output == other.output
+
+
 class Controller:
     """Estimator → policy → trajectory generator → wrench distribution → joint command, once a tick.
 
@@ -164,6 +177,10 @@ class Controller:
         self.parameters = core["parameters"]
         self.geometry = core["geometry"]
         self.policy_record = core["policy"]
+        self.tuning = memory[CORE_DTYPE.fields["parameters"][1] :].view(np.float64)[:TUNING_SIZE]  # type: ignore[index]
+        """The tunable parameters as one row of numbers, in force from the next step on. Shape (TUNING_SIZE,)."""
+        self._outgoing_record = core["outgoing"]
+        self._own_record = np.zeros(1, POLICY_DTYPE)
         self._memory = (memory, self.record.view(np.uint8))
         self.parameters[:] = build_parameters(description, config)
         self.geometry[:] = leg_geometry(description)
@@ -189,6 +206,31 @@ class Controller:
         self._policy = policy
         self._direct = policy.output == "grf"
         self.policy_record[:] = policy_record(policy)
+        self.tuning[0] = 1.0
+
+    def hand_over(self, policy: Policy) -> None:
+        """Take another policy with no share yet; what was active goes on as the outgoing one. ``share`` moves on.
+
+        Raises:
+            ValueError: the two differ in reading or output, so that there is nothing between them.
+        """
+        if not alike(self._policy, policy):
+            raise ValueError(f"policies {self._policy.name} and {policy.name} differ in reading or output")
+        self._outgoing_record[:] = policy_record(self._policy)
+        self._policy = policy
+        self._own_record[:] = policy_record(policy)
+        self.policy_record[:] = self._own_record
+        self.share = 0.0
+
+    @property
+    def share(self) -> float:
+        """Of the active policy in what is asked for; below one while it is handed over to."""
+        return float(self.tuning[0])
+
+    @share.setter
+    def share(self, share: float) -> None:
+        self.tuning[0] = share
+        mix_terms(self.policy_record, self._own_record, self._outgoing_record, share)
 
     def reset(self, measurement: Measurement) -> None:
         """Forget everything and start from this measurement, all four feet on the ground, at rest."""

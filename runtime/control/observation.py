@@ -26,7 +26,8 @@ def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
     """Fill ``observation`` (28,) with 14 numbers now and the same 14 one tick ago, scaled.
 
     The *relative* reading subtracts what is wanted: walking height, commanded heading, commanded velocity and turn. The
-    *plain* one is the paper's letter. The velocity error is bounded where the policy says so (Past the teacher 4).
+    *plain* one is the paper's letter. Both subtract the body pose that the operator asks for. The velocity error is
+    bounded where the policy says so (Past the teacher 4).
     """
     now = t.observation
     now[0] = t.height
@@ -47,9 +48,13 @@ def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
             now[4 + i] = min(bound, max(-bound, error))
             if now[4 + i] != error:
                 t.clamps |= _OBSERVATION
+    now[0] -= p.body_pose[3]
+    for i in range(3):
+        now[1 + i] -= p.body_pose[i]
     for i in range(14):
         before = s.previous[i] if s.remembered else now[i]
         s.previous[i] = now[i]
+        s.seen[i], s.seen[14 + i] = now[i], before
         t.observation[i] = now[i] * policy.observation_scale[i]
         t.observation[14 + i] = before * policy.observation_scale[14 + i]
     s.remembered = 1

@@ -56,6 +56,10 @@ class Policy(Record, frozen=True, kw_only=True):
     name: Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,63}$")]
     robot: str
     """The robot that it was made for."""
+    rate_hz: NonNegative = 0.0
+    """Ticks a second that it was made for; 0 where it does not say."""
+    layout: str = ""
+    """``layout_hash`` of the version that made it; empty where it does not say."""
     reading: Literal["relative", "plain"] = "relative"
     output: Literal["wrench", "grf"] = "wrench"
     observation_names: tuple[str, ...]
@@ -101,6 +105,27 @@ def policy_record(policy: Policy) -> Records:
     return record
 
 
+_MIXED = (
+    "action_bound",
+    "shift_time_constant",
+    *(name for name in Terms.__struct_fields__ if name != "velocity_error_bound"),
+)
+
+
+def mix_terms(mixed: Records, active: Records, outgoing: Records, share: float) -> None:
+    """Everything of a policy but its layers between two of them: ``share`` of ``active``, the rest ``outgoing``.
+
+    The observation's bound may be infinite, so it is its inverse that moves.
+    """
+    m, a, o = mixed[0], active[0], outgoing[0]
+    for name in _MIXED:
+        m[name] = share * a[name] + (1.0 - share) * o[name] if share < 1.0 else a[name]
+    m["velocity_error_bound"] = a["velocity_error_bound"]
+    if share < 1.0:
+        inverse = share / float(a["velocity_error_bound"]) + (1.0 - share) / float(o["velocity_error_bound"])
+        m["velocity_error_bound"] = 1.0 / inverse if inverse > 0.0 else np.inf
+
+
 def set_parameters(record: Records, policy: Policy, parameters: Array) -> None:
     """Write the trained numbers of a policy of this shape into its record: what training does before an episode."""
     r = record[0]
@@ -115,29 +140,23 @@ def set_parameters(record: Records, policy: Policy, parameters: Array) -> None:
 
 
 @compiled
-def act(p, policy, s, t):  # type: ignore[no-untyped-def]
+def act(p, policy, outgoing, s, t):  # type: ignore[no-untyped-def]
     """Fill ``asked`` and ``action`` (18,) from the observation; a direct policy's forces go into ``grf`` (4, 3).
 
-    Bounds are the tighter of the policy's own and the robot's; the shifts are low-passed before theirs. Returns whether
-    all that was asked is finite: a bound would make a number of what is none.
+    Bounds are the tighter of the policy's own and the robot's; the shifts are low-passed before theirs. While the
+    policy's share is below one, the ``outgoing`` one has the rest; both have one reading and one kind of output.
+    Returns whether all that was asked is finite: a bound would make a number of what is none.
     """
     actions = 24 if policy.direct else 18
     out = np.zeros(24)
-    if policy.hidden_size > 0:
-        for h in range(policy.hidden_size):
-            total = 0.0
-            for i in range(28):
-                total += policy.hidden[h, i] * t.observation[i]
-            total = np.tanh(total)
-            for a in range(actions):
-                out[a] += policy.readout[a, h] * total
-    else:
+    ask(policy, t.observation, actions, out)
+    if p.policy_share < 1.0:
+        other, seen = np.zeros(24), np.empty(28)
         for i in range(28):
-            seen = t.observation[i]
-            for a in range(24):
-                out[a] += policy.matrix[i, a] * seen
-    for a in range(actions):
-        out[a] *= policy.action_scale[a]
+            seen[i] = s.seen[i] * outgoing.observation_scale[i]
+        ask(outgoing, seen, actions, other)
+        for a in range(actions):
+            out[a] = p.policy_share * out[a] + (1.0 - p.policy_share) * other[a]
     for leg in range(4):
         for i in range(2):
             out[3 * leg + i] += policy.capture_point * (t.twist[i] - t.velocity_command[i])
@@ -154,6 +173,26 @@ def act(p, policy, s, t):  # type: ignore[no-untyped-def]
         if t.action[12 + i] != out[12 + i]:
             t.clamps |= _WRENCH
     return True
+
+
+@compiled
+def ask(policy, observation, actions, out):  # type: ignore[no-untyped-def]
+    """What the policy alone answers to a scaled ``observation`` (28,), into the blank ``out`` (24,)."""
+    if policy.hidden_size > 0:
+        for h in range(policy.hidden_size):
+            total = 0.0
+            for i in range(28):
+                total += policy.hidden[h, i] * observation[i]
+            total = np.tanh(total)
+            for a in range(actions):
+                out[a] += policy.readout[a, h] * total
+    else:
+        for i in range(28):
+            value = observation[i]
+            for a in range(24):
+                out[a] += policy.matrix[i, a] * value
+    for a in range(actions):
+        out[a] *= policy.action_scale[a]
 
 
 @compiled

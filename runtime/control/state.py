@@ -12,7 +12,7 @@ from drivers.description import SIDE, RobotDescription, composite_inertia
 from runtime.control.gait import GAITS, gait_table
 from runtime.control.kinematics import inverse, leg_geometry
 from runtime.control.parameters import ControlConfig
-from runtime.control.records import Records
+from runtime.control.records import Fields, Records
 
 WORK_DTYPE = np.dtype(
     [
@@ -65,6 +65,7 @@ STATE_DTYPE = np.dtype(
         ("heading", "f8"),  # rad, where the commanded turn has led
         # observation, policy
         ("previous", "f8", (14,)),
+        ("seen", "f8", (28,)),  # the observation before its scales
         ("remembered", "u1"),
         ("shifts", "f8", (4, 3)),
         # gait
@@ -75,6 +76,7 @@ STATE_DTYPE = np.dtype(
         ("stance", "u1", (4,)),
         # trajectory
         ("foot_targets", "f8", (4, 3)),
+        ("posed_yaw", "f8"),  # of the body pose that the foot targets were turned by, rad
         ("depth", "f8", (4,)),  # how far a searching leg has gone down, m
         # torque
         ("joint_targets", "f8", (4, 3)),
@@ -84,28 +86,37 @@ STATE_DTYPE = np.dtype(
     align=True,
 )
 
+TUNING_FIELDS: Fields = [
+    ("policy_share", "f8"),  # of the active policy; the rest is the outgoing one's
+    ("gait_offset", "f8", (4,)),
+    ("swing_fraction", "f8"),
+    ("cycle_time", "f8"),
+    ("swing_time", "f8"),
+    ("stance_time", "f8"),
+    ("swing_height", "f8"),
+    ("walking_height", "f8"),
+    ("kp", "f8", (3,)),
+    ("kd", "f8", (3,)),
+    ("stance_scale", "f8"),
+    ("standing_scale", "f8"),
+    ("body_pose", "f8", (4,)),  # roll, pitch, yaw, rad, and height, m, beside what is walked with
+]
+"""What an operator may change while the robot lives. All float64, so that they are one row of numbers too."""
+TUNING_DTYPE = np.dtype(TUNING_FIELDS, align=True)
+TUNING_SIZE = TUNING_DTYPE.itemsize // 8
+
 PARAMETERS_DTYPE = np.dtype(
     [
+        *TUNING_FIELDS,  # first, so that they are the first numbers of the record
         ("dt", "f8"),
         ("mass", "f8"),
         ("com", "f8", (3,)),  # of the whole robot in its stand pose, from the body origin, body frame, m
         ("nominal_footholds", "f8", (4, 2)),
         # gait
-        ("gait_offset", "f8", (4,)),
-        ("swing_fraction", "f8"),
-        ("cycle_time", "f8"),
-        ("swing_time", "f8"),
-        ("stance_time", "f8"),
-        ("swing_height", "f8"),
-        ("walking_height", "f8"),
         ("early_contact", "u1"),
         ("search_speed", "f8"),
         ("search_depth", "f8"),
         # torque
-        ("kp", "f8", (3,)),
-        ("kd", "f8", (3,)),
-        ("stance_scale", "f8"),
-        ("standing_scale", "f8"),
         ("max_joint_speed", "f8"),
         # contact
         ("contact_threshold", "f8"),
@@ -182,6 +193,7 @@ def build_parameters(description: RobotDescription, config: ControlConfig) -> Re
     p["nominal_footholds"][:, 0] += com[0]
     p["nominal_footholds"][:, 1] += SIDE * description.abduction_length + com[1]
     set_gait(parameters, config)
+    p["policy_share"] = 1.0
     gains, grf, bounds, contact = config.gains, config.grf, config.bounds, config.contact
     p["kp"], p["kd"] = gains.kp, gains.kd
     for name in ("stance_scale", "standing_scale", "max_joint_speed"):

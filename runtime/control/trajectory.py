@@ -15,7 +15,9 @@ def aim_feet(p, g, policy, s, t):  # type: ignore[no-untyped-def]
     target is set to the measured foot only at liftoff and at the end of a swing: taken anew every tick it would leave
     the motors an error of one step and no drive.
     """
-    ground = g.foot_radius - p.walking_height
+    ground = g.foot_radius - p.walking_height - p.body_pose[3]
+    turn = p.body_pose[2] - s.posed_yaw
+    s.posed_yaw = p.body_pose[2]
     for leg in range(4):
         target = s.foot_targets[leg]
         nominal = p.nominal_footholds[leg]
@@ -36,6 +38,10 @@ def aim_feet(p, g, policy, s, t):  # type: ignore[no-untyped-def]
             vy = t.velocity_command[1] + t.velocity_command[2] * target[0]
             target[0] -= vx * p.dt
             target[1] -= vy * p.dt
+            if turn != 0.0:
+                x, y = target[0], target[1]
+                target[0] = math.cos(turn) * x + math.sin(turn) * y
+                target[1] = math.cos(turn) * y - math.sin(turn) * x
             s.depth[leg] = min(p.search_depth, s.depth[leg] + p.search_speed * p.dt) if s.searching[leg] else 0.0
             target[2] = ground - s.depth[leg]
         t.foot_targets[leg, 0], t.foot_targets[leg, 1] = target[0], target[1]

@@ -48,6 +48,8 @@ class Outing:
         self.command = damp_command(self.config.damp.kd)
         self.index = 0
         """Ticks so far."""
+        self.after: Callable[[], None] = lambda: None
+        """Called after every tick, in the place of the daemon's slack."""
         self.policies: dict[int, str] = {}
         """Those before the active one, by generation."""
 
@@ -63,6 +65,7 @@ class Outing:
             self.command = self.cycle.step(Wake(self.index, now, 1.0 / rate, 5e-5, 0), self.measurement)
             self.cycle.tick["compute"] = 2e-4
             self._keep()
+            self.after()
 
     def _keep(self) -> None:
         self.recorder.keep(self.cycle.tick)
