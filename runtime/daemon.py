@@ -92,6 +92,8 @@ class Daemon:
         self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
         self._stop: asyncio.Event | None = None
         self._held = False
+        self._damped = False
+        """The body was asked to damp, for good."""
 
     async def run(self) -> None:
         """Serve until a signal or ``stop``.
@@ -179,6 +181,7 @@ class Daemon:
                 sender.cancel()
                 writer.cancel()
         finally:
+            await self._damp_body()  # before anything that waits for a disk
             notifier.tell("STOPPING=1")
             self._hold_garbage(False)
             self._finish()
@@ -220,7 +223,10 @@ class Daemon:
                     notifier.tell("WATCHDOG=1")
 
     async def _damp_body(self) -> None:
-        """Ask the body to damp until it has answered a few times or the deadline is up. Never raises."""
+        """Ask the body to damp, once, until it has answered a few times or the deadline is up. Never raises."""
+        if self._damped:
+            return
+        self._damped = True
         config = self.config.damp
         command = damp_command(config.kd)
         replies = 0

@@ -14,6 +14,7 @@ from faults.rig import Fault, Rig
 from runtime import policies
 from runtime.control.grf import GrfProblem
 from runtime.control.policy import Policy
+from runtime.messages import Request
 
 
 @dataclass
@@ -88,6 +89,22 @@ class RefusedPolicy(Fault):
             return
         rig.cycle.swap_policy(policy)
         raise AssertionError("the door let it in")
+
+
+@dataclass
+class EmergencyStop(Fault):
+    """The operator asks for damp."""
+
+    def start(self, rig: Rig) -> None:
+        rig.ask(Request.DAMP)
+
+
+@dataclass
+class LostOperator(Fault):
+    """No velocity command comes any more."""
+
+    def start(self, rig: Rig) -> None:
+        rig.velocity = None
 
 
 @dataclass

@@ -17,7 +17,9 @@ from drivers.motors import NOT_STARTING, RESTARTED
 from faults import wire
 from faults.computer import (
     ClockStep,
+    EmergencyStop,
     Infeasible,
+    LostOperator,
     PolicyWhileFalling,
     Push,
     RefusedPolicy,
@@ -290,6 +292,8 @@ ROWS: tuple[Row, ...] = (
     Row("stall_100ms", lambda d: Stall(0.1), lambda d: Stall(0.1)),
     Row("stall_1000ms", lambda d: Stall(1.0), lambda d: Stall(1.0), "damp", 2),
     Row("clock_step", lambda d: ClockStep(float(d.choice([-3600.0, -1.0, -0.1, 0.1, 1.0, 3600.0])))),
+    Row("operator_stops", lambda d: EmergencyStop(), lambda d: EmergencyStop(), "damp", 1),
+    Row("operator_lost", lambda d: LostOperator(), must="stay", seconds=1.5),
     Row(
         "knocked_over",
         lambda d: knock(d),

@@ -135,6 +135,8 @@ class Watch:
                 return
         if (command.kp < 0).any() or (command.kd < 0).any():
             self.violate("a gain below zero")
+        if self.rig.mode is Mode.DAMP and (command.kp.any() or command.torque.any() or not (command.kd > 0).all()):
+            self.violate("damps with more than damping")
         if self.rig.mode in GOING and measurement is not None:
             foreseen = np.abs(motor_torque(command, measurement.joints))
             if (foreseen > self._peak * (1 + 1e-9)).any():
