@@ -33,6 +33,7 @@ log = logging.getLogger("trotd")
 POLICIES = 9
 """Files of policies that a recording takes along: the active one and those before it."""
 VERSIONED = ("trotd", "numpy", "numba", "daqp", "msgspec", "eclipse-zenoh")
+STOPPING = "the daemon is stopping"
 Result = TypeVar("Result")
 
 
@@ -142,9 +143,12 @@ class FlightLog:
                 _, reason, done = self._waiting.popleft()
                 try:
                     path = await asyncio.to_thread(self.write, reason)
-                except OSError as error:
+                except (OSError, asyncio.CancelledError) as error:
+                    stopping = isinstance(error, asyncio.CancelledError)
                     if done is not None:
-                        done.set_exception(error)
+                        done.set_exception(OSError(STOPPING) if stopping else error)
+                    if stopping:
+                        raise
                 else:
                     if done is not None:
                         done.set_result(path)
@@ -153,7 +157,7 @@ class FlightLog:
         """The loop is over: keep its recording, disappoint who still waits for one."""
         for _, _, done in self._waiting:
             if done is not None:
-                done.set_exception(OSError("the daemon is stopping"))
+                done.set_exception(OSError(STOPPING))
         self._waiting.clear()
         if self.recorder.count:
             with contextlib.suppress(OSError):

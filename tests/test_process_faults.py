@@ -159,7 +159,7 @@ def test_a_disk_that_hangs_holds_up_neither_the_loop_nor_the_stop_nor_the_dampin
         done = asyncio.get_running_loop().run_in_executor(
             None, lambda: _write_recording(served.config.robot.name, served.config.link.listen[0])
         )
-        while not hanging.is_set():
+        while not hanging.is_set():  # noqa: ASYNC110
             await asyncio.sleep(0.005)
         await ticks(served, 40)
         assert served.daemon.cycle.state.mode is Mode.WALK
@@ -223,10 +223,13 @@ def test_a_joystick_that_is_killed_stops_the_walk(tmp_path: Path) -> None:
             "import sys, time; from station.session import connected\n"
             "with connected(sys.argv[1], sys.argv[2]) as s:\n"
             "    t = s.session.liveliness().declare_token(s.keys.operator + '/me')\n"
-            "    while True: s.session.put(s.keys.velocity, sys.argv[3].encode()); print('x', flush=True); time.sleep(0.02)"
+            "    while True:\n"
+            "        s.session.put(s.keys.velocity, sys.argv[3].encode()); print('x', flush=True); time.sleep(0.02)"
         )
         arguments = [served.config.robot.name, served.config.link.listen[0], FORWARD.decode()]
-        with subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE) as pad:
+        with subprocess.Popen(  # noqa: ASYNC220
+            [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE
+        ) as pad:
             assert pad.stdout is not None
             await asyncio.to_thread(pad.stdout.readline)
             async with asyncio.timeout(20):
