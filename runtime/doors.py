@@ -7,6 +7,7 @@ taken is refused with a reason, and counted by its key.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -36,6 +37,7 @@ from runtime.messages import (
     TuningEntry,
     TuningReply,
     TuningRequest,
+    VelocityMessage,
 )
 from runtime.recording import list_recordings
 from runtime.shelf import PolicyFile
@@ -99,6 +101,9 @@ class Entrance:
         self._channels = [channel for channel in channels if channel.accept is not None]
         self._told: dict[str, float] = {}
         self._newest: VelocityCommand | None = None
+        self._heard = -math.inf
+        self._locked = True
+        """The sticks were not centred since commands came again."""
 
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Open every door; needs the running loop."""
@@ -157,11 +162,25 @@ class Entrance:
         except MessageError as error:
             self._refuse(self._keys.velocity, str(error))
             return
+        if message.sticks and not self._centred(stamp, message):
+            message = VelocityMessage((0.0, 0.0), 0.0)
+        self._heard = stamp
         waiting, self._newest = self._newest, VelocityCommand(stamp, np.array(message.linear), message.yaw_rate)
         if waiting is None:
             self._cross(self._take_newest)
         else:
             self.refused[SHED] += 1
+
+    def _centred(self, stamp: float, message: VelocityMessage) -> bool:
+        """Whether sticks may move the robot: since the last silence they have to have been in the middle once."""
+        silence = stamp - self._heard
+        if silence > self._config.command.expiry:
+            self._locked = True
+        if not any((*message.linear, message.yaw_rate)):
+            self._locked = False
+        if self._locked:
+            self._refuse(self._keys.velocity, "centre the sticks: no command had come for a while")
+        return not self._locked
 
     def _take_newest(self) -> None:
         newest, self._newest = self._newest, None

@@ -162,6 +162,8 @@ class VelocityMessage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     linear: tuple[float, float]
     yaw_rate: float
+    sticks: bool = False
+    """From a person's sticks: after a silence nothing moves until they were centred."""
 
 
 class ModeReply(msgspec.Struct, frozen=True):

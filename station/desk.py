@@ -13,7 +13,7 @@ from runtime.control.parameters import BoundsConfig
 from station import keyboard as terminal
 from station.driving import Driving
 from station.joystick import Joystick, Source
-from station.pad import PadDevice, find_pad, load_mapping, shipped_mappings
+from station.pad import GAITS, PadDevice, find_pad, load_mapping, shipped_mappings
 from station.session import Station
 
 
@@ -36,10 +36,9 @@ def drive(
     station: Station, bounds: BoundsConfig, keys: bool, pad: Path | None, mapping: Path | None, speed: float
 ) -> None:
     """Drive until Ctrl-C; ``speed`` is the share of the bounds that full sticks ask for."""
-    if mapping is not None:
-        load_mapping(mapping)
+    gaits = GAITS if mapping is None else load_mapping(mapping).gaits
     forward, sideways = bounds.linear_velocity
-    joystick = Joystick(station, Driving(speed * forward, speed * sideways, speed * bounds.yaw_rate))
+    joystick = Joystick(station, Driving(speed * forward, speed * sideways, speed * bounds.yaw_rate, gaits))
     console = Console(stderr=True)
     if keys:
         console.print(terminal.HELP, highlight=False)
@@ -62,6 +61,8 @@ def describe(joystick: Joystick) -> Text:
         f"link {latency}",
         ready if status.mode == "WALK" else "",
         f"FAULT {status.fault}" if status.fault else "",
+        "POSE" if joystick.driving.posing else joystick.driving.gaits[0],
         joystick.words,
+        f"last refused: {joystick.refusal}" if joystick.refusal and joystick.refusal not in joystick.words else "",
     ]
     return Text("   ".join(filter(None, parts)), style="red" if status.fault else "")

@@ -5,11 +5,14 @@ After anything was lost, and at the start of every walk, nothing moves until the
 
 from __future__ import annotations
 
-from runtime.messages import Mode, Request
-from station.pad import Sticks
+from collections.abc import Sequence
+
+from runtime.messages import Mode, PoseMessage, Request
+from station.pad import GAITS, Sticks
 
 Velocity = tuple[float, float, float]
 STILL: Velocity = (0.0, 0.0, 0.0)
+LEVEL = PoseMessage(0.0, 0.0, 0.0, 0.0)
 REQUESTS = {
     "idle": Request.DAMP,
     "hold": Request.STAND,
@@ -23,8 +26,13 @@ REQUESTS = {
 class Driving:
     """The rules of one driver."""
 
-    def __init__(self, forward: float, sideways: float, turn: float) -> None:
+    def __init__(self, forward: float, sideways: float, turn: float, gaits: Sequence[str] = GAITS) -> None:
         """``forward``, ``sideways`` in m/s and ``turn`` in rad/s are what full sticks ask for."""
+        self.gaits = list(gaits)
+        """The gait button goes through them; the first is the one in use."""
+        self.posing = False
+        """The sticks move the standing body."""
+        self._pose = LEVEL
         self.full: Velocity = (forward, sideways, turn)
         self.centred = False
         """The sticks were centred since the last loss or the start of the walk."""
@@ -41,7 +49,8 @@ class Driving:
             mode: the robot's last word; None when it has not been heard for a while.
         """
         if mode is not Mode.WALK:
-            self.lose()
+            if not self.posing:
+                self.lose()
             return None
         if sticks is None:
             self.lose()
@@ -54,6 +63,34 @@ class Driving:
             return STILL
         forward, sideways, turn = self.full
         return sticks.forward * forward, sticks.left * sideways, sticks.turn * turn
+
+    def toggle_pose(self, mode: Mode | None) -> PoseMessage | None:
+        """The pose button: the sticks are the body's, or the body goes level again. Returns what to say now."""
+        self.lose()
+        self.posing = mode is Mode.STAND and not self.posing
+        self._pose = LEVEL
+        return None if self.posing else LEVEL
+
+    def pose(self, sticks: Sticks | None, mode: Mode | None) -> PoseMessage | None:
+        """What body pose to ask for, in shares of the bounds; None when there is nothing to say.
+
+        Left stick: pitch and roll, as the body should lean; right stick: yaw and height. Without the dead-man the body
+        stays as it is.
+        """
+        if mode is not Mode.STAND:
+            self.posing = False
+        if not self.posing or sticks is None:
+            return None
+        if sticks.level:
+            self.centred = True
+        if self.centred and sticks.held:
+            self._pose = PoseMessage(-sticks.turn + 0.0, sticks.forward, sticks.left, sticks.rise)
+        return self._pose
+
+    def next_gait(self) -> str:
+        """The gait button: the next of the list."""
+        self.gaits.append(self.gaits.pop(0))
+        return self.gaits[0]
 
     @staticmethod
     def requests(button: str, sticks: Sticks | None, armed: bool) -> list[Request]:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import msgspec
 import zenoh
 
-from runtime.messages import Mode, ModeReply, Request, Status
+from runtime.messages import Mode, PoseMessage, Request, Status, TuningReply, TuningRequest
 from station.driving import STILL, Driving
 from station.pad import SourceLost, Sticks
 from station.session import Station
@@ -50,6 +50,8 @@ class Joystick:
         """Round trip of the last question, s."""
         self.words = ""
         """The robot's last answer to a button."""
+        self.refusal = ""
+        """What it refused last, and why."""
         self._station = station
         self._heard = -DEAF_SECONDS
         self._pinged = 0.0
@@ -105,6 +107,9 @@ class Joystick:
         velocity = self.driving.velocity(sticks, mode)
         if velocity is not None:
             self._say(velocity)
+        pose = self.driving.pose(sticks, mode)
+        if pose is not None:
+            self._say_pose(pose)
         if now - self._pinged > PING_SECONDS:
             self._pinged = now
             self._ping(now)
@@ -116,24 +121,50 @@ class Joystick:
 
     def _say(self, velocity: tuple[float, float, float]) -> None:
         forward, left, turn = velocity
-        self._velocity.put(json.dumps({"linear": [forward, left], "yaw_rate": turn}))
+        self._velocity.put(json.dumps({"linear": [forward, left], "yaw_rate": turn, "sticks": True}))
+
+    def _say_pose(self, pose: PoseMessage) -> None:
+        self._station.session.put(
+            self._station.keys.pose, msgspec.json.encode(pose), congestion_control=zenoh.CongestionControl.DROP
+        )
 
     def _press(self, button: str, sticks: Sticks | None) -> None:
+        if button == "pose":
+            mode = None if self.status is None else Mode[self.status.mode]
+            pose = self.driving.toggle_pose(mode)
+            self.words = "the sticks drive" if mode is Mode.STAND else "pose: only while standing"
+            if self.driving.posing:
+                self.words = "the sticks move the body"
+            if pose is not None:
+                self._say_pose(pose)
+            return
+        if button == "gait":
+            change = TuningRequest("gait", self.driving.next_gait())
+            self._query(f"gait {change.value}", self._station.keys.change_tuning, msgspec.json.encode(change))
+            return
         armed = self.status is not None and self.status.armed
         for wish in self.driving.requests(button, sticks, armed):
             self._ask(wish)
 
     def _ask(self, wish: Request) -> None:
+        self._query(wish.value, self._station.keys.mode, wish.value.encode())
+
+    def _query(self, what: str, key: str, payload: bytes) -> None:
         """Ask without waiting; the answer arrives on one of zenoh's threads."""
 
         def answered(reply: zenoh.Reply) -> None:
-            words = "no answer, or this certificate may not drive"
+            accepted, words = False, "no answer, or this certificate may not drive"
             if reply.ok is not None:
-                answer = msgspec.json.decode(reply.ok.payload.to_bytes(), type=ModeReply)
-                words = answer.reason if answer.accepted else f"refused: {answer.reason}"
-            self._inbox.append(lambda: setattr(self, "words", f"{wish.value}: {words}"))
+                answer = msgspec.json.decode(reply.ok.payload.to_bytes(), type=TuningReply)
+                accepted, words = answer.accepted, answer.reason
+            self._inbox.append(lambda: self._take_answer(what, accepted, words))
 
-        self._station.session.get(self._station.keys.mode, answered, payload=wish.value, timeout=2.0)
+        self._station.session.get(key, answered, payload=payload, timeout=2.0)
+
+    def _take_answer(self, what: str, accepted: bool, words: str) -> None:
+        self.words = f"{what}: {words}" if accepted else f"{what}: refused: {words}"
+        if not accepted:
+            self.refusal = f"{what}: {words}"
 
     def _ping(self, sent: float) -> None:
         def answered(_reply: zenoh.Reply) -> None:

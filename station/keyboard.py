@@ -19,10 +19,13 @@ MOVES = {
     "d": ("left", -1.0),
     "q": ("turn", 1.0),
     "e": ("turn", -1.0),
+    "r": ("rise", 1.0),
+    "f": ("rise", -1.0),
 }
-BUTTONS = {"0": "idle", " ": "hold", "x": "sit", "y": "stand", "b": "walk", "c": "clear"}
+BUTTONS = {"0": "idle", " ": "hold", "x": "sit", "y": "stand", "b": "walk", "c": "clear", "p": "pose", "g": "gait"}
 SPEEDS = {str(n): n / 9 for n in range(1, 10)}
-HELP = "w s forward/back, a d sideways, q e turn, 1-9 speed; y stand, b walk, space hold, x sit, 0 damp, c clear"
+HELP = "w s forward/back, a d sideways, q e turn, 1-9 speed; y stand, b walk, space hold, x sit, 0 damp, c clear;"
+HELP += " g next gait, p pose: the same keys lean and turn the standing body, r f up and down"
 
 
 class Keys:

@@ -19,6 +19,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers.description import Record
+from runtime.control.parameters import GaitName
 from station.session import StationError
 
 PADS = Path(__file__).parent / "pads"
@@ -47,6 +48,8 @@ class Axes(Record, frozen=True, kw_only=True):
     forward: Axis
     left: Axis
     turn: Axis
+    rise: Axis | None = None
+    """Up and down, for the body's pose alone."""
 
 
 class Buttons(Record, frozen=True, kw_only=True):
@@ -59,6 +62,11 @@ class Buttons(Record, frozen=True, kw_only=True):
     walk: Code
     clear: Code
     dead_man: Code
+    pose: Code | None = None
+    gait: Code | None = None
+
+
+GAITS: tuple[GaitName, ...] = ("trot", "walk", "pace")
 
 
 class PadMapping(Record, frozen=True, kw_only=True):
@@ -68,6 +76,8 @@ class PadMapping(Record, frozen=True, kw_only=True):
     """Parts of the names of devices that it fits."""
     dead_zone: Annotated[float, Meta(ge=0, lt=1)] = 0.12
     """Share of a stick's way around its middle that counts as centred."""
+    gaits: tuple[GaitName, ...] = GAITS
+    """What the gait button goes through."""
     axes: Axes
     buttons: Buttons
 
@@ -79,13 +89,28 @@ class Sticks:
     forward: float = 0.0
     left: float = 0.0
     turn: float = 0.0
+    rise: float = 0.0
     held: bool = False
     """The dead-man button is down."""
 
     @property
     def centred(self) -> bool:
-        """All in the middle."""
+        """All that drive in the middle."""
         return self.forward == self.left == self.turn == 0.0
+
+    @property
+    def level(self) -> bool:
+        """All in the middle, that of the height too."""
+        return self.centred and self.rise == 0.0
+
+
+DRIVING = {"forward", "left", "turn"}
+
+
+def used_axes(mapping: PadMapping) -> dict[str, Axis]:
+    """The axes that a mapping names."""
+    found = {name: getattr(mapping.axes, name) for name in mapping.axes.__struct_fields__}
+    return {name: axis for name, axis in found.items() if axis is not None}
 
 
 class SourceLost(StationError):
@@ -103,13 +128,12 @@ class Pad:
             ranges: low and high reading by axis code, where the device tells them.
         """
         self.known = False
-        """All three axes have been heard since the start or since events were lost."""
+        """All three axes that drive have been heard since the start or since events were lost."""
         self._mapping = mapping
-        named = (("forward", mapping.axes.forward), ("left", mapping.axes.left), ("turn", mapping.axes.turn))
-        self._axes = {axis.code: (name, axis) for name, axis in named}
+        self._axes = {axis.code: (name, axis) for name, axis in used_axes(mapping).items()}
         self._ranges = {code: (ranges or {}).get(code, (axis.low, axis.high)) for code, (_, axis) in self._axes.items()}
         codes = ((name, getattr(mapping.buttons, name)) for name in mapping.buttons.__struct_fields__)
-        self._names: dict[int, str] = {code: name for name, code in codes}
+        self._names: dict[int, str] = {code: name for name, code in codes if code is not None}
         self._values: dict[str, float] = {}
         self._held = False
         self._rest = b""
@@ -156,7 +180,7 @@ class Pad:
         if kind == EV_ABS and code in self._axes:
             name, axis = self._axes[code]
             self._values[name] = axis.sign * _share(value, *self._ranges[code], self._mapping.dead_zone)
-            self.known = len(self._values) == len(self._axes)
+            self.known = self._values.keys() >= DRIVING
         elif kind == EV_KEY and code in self._names:
             name = self._names[code]
             if name == "dead_man":
@@ -207,7 +231,7 @@ class PadDevice:
             self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
             raise SourceLost(f"pad {path}: {error.strerror}") from error
-        axes = (mapping.axes.forward, mapping.axes.left, mapping.axes.turn)
+        axes = used_axes(mapping).values()
         told = {axis.code: info for axis in axes if (info := _axis_info(self._fd, axis.code)) is not None}
         self.pad = Pad(mapping, {code: (low, high) for code, (_, low, high) in told.items()})
         for code, (value, _, _) in told.items():

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import struct
 from collections.abc import Awaitable, Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -13,15 +15,17 @@ from daemons import Served, make_config
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.messages import Mode, Request
-from station.driving import STILL, Driving
+from runtime import config
+from runtime.control.records import Clamp
+from runtime.messages import Mode, PoseMessage, Request
+from station.driving import LEVEL, STILL, Driving
 from station.joystick import Joystick
 from station.keyboard import HOLD_SECONDS, Keys
-from station.pad import EVENT, Pad, PadDevice, SourceLost, Sticks, load_mapping, shipped_mappings
-from station.session import Station, StationError
+from station.pad import EVENT, Pad, PadDevice, SourceLost, Sticks, load_mapping, shipped_mappings, used_axes
+from station.session import Station, StationError, connected
 
 XPAD = dict(shipped_mappings())["xpad"]
-FORWARD, TURN, LEFT = 1, 0, 3
+FORWARD, TURN, LEFT, RISE = 1, 0, 3, 4
 BUMPER, B, BACK = 311, 305, 314
 SHARE = st.floats(-1, 1)
 STICKS = st.builds(Sticks, forward=SHARE, left=SHARE, turn=SHARE, held=st.booleans())
@@ -105,8 +109,8 @@ def test_a_stick_never_asks_for_more_than_all(value: int, other: int) -> None:
 def test_shipped_mappings_give_every_stick_and_button_a_code_of_its_own(name: str) -> None:
     mapping = dict(shipped_mappings())[name]
     codes = [getattr(mapping.buttons, field) for field in mapping.buttons.__struct_fields__]
-    assert len(set(codes)) == len(codes)
-    assert len({mapping.axes.forward.code, mapping.axes.left.code, mapping.axes.turn.code}) == 3
+    assert len(set(codes)) == len(codes) and None not in codes
+    assert len({axis.code for axis in used_axes(mapping).values()}) == 4
 
 
 @pytest.mark.parametrize(
@@ -163,7 +167,7 @@ def test_a_key_counts_as_held_only_while_it_repeats() -> None:
 def test_any_bytes_from_the_terminal_are_borne(data: bytes) -> None:
     keys = Keys()
     for name in keys.feed(data):
-        assert Driving.requests(name, keys.sticks, armed=False)
+        assert name in ("pose", "gait") or Driving.requests(name, keys.sticks, armed=False)
     assert all(abs(share) <= 1 for share in (keys.sticks.forward, keys.sticks.left, keys.sticks.turn))
 
 
@@ -188,6 +192,41 @@ def test_nothing_moves_before_the_sticks_were_centred_nor_without_the_dead_man(
             assert velocity == STILL
         else:
             assert velocity == (sticks.forward, sticks.left, sticks.turn)
+
+
+@given(st.lists(st.tuples(st.one_of(st.none(), STICKS), MODES, st.booleans()), max_size=60))
+def test_the_body_leans_only_in_stand_after_the_button_once_centred_with_the_dead_man(
+    script: list[tuple[Sticks | None, Mode | None, bool]],
+) -> None:
+    driving = Driving(1.0, 1.0, 1.0)
+    for sticks, mode, pressed in script:
+        if pressed:
+            said = driving.toggle_pose(mode)
+            assert (said is None) == driving.posing and (not driving.posing or mode is Mode.STAND)
+        before = driving.centred
+        pose, velocity = driving.pose(sticks, mode), driving.velocity(sticks, mode)
+        assert pose is None or velocity is None, "the sticks mean one thing"
+        if mode is not Mode.STAND:
+            assert pose is None
+        if pose is not None and pose != LEVEL and sticks is not None and sticks.held:
+            assert before or sticks.level or driving.centred
+
+
+def test_the_sticks_lean_the_body_the_way_they_are_pushed_and_let_go_it_stays() -> None:
+    driving = Driving(1.0, 1.0, 1.0)
+    driving.toggle_pose(Mode.STAND)
+    pushed = Sticks(forward=0.5, left=0.4, turn=0.3, rise=-0.2, held=True)
+    assert driving.pose(pushed, Mode.STAND) == LEVEL, "the sticks were never centred"
+    driving.pose(Sticks(held=True), Mode.STAND)
+    assert driving.pose(pushed, Mode.STAND) == PoseMessage(roll=-0.3, pitch=0.5, yaw=0.4, height=-0.2)
+    assert driving.pose(Sticks(held=False), Mode.STAND) == PoseMessage(-0.3, 0.5, 0.4, -0.2)
+    assert driving.toggle_pose(Mode.STAND) == LEVEL
+    assert driving.pose(pushed, Mode.STAND) is None
+
+
+def test_the_gait_button_goes_through_the_mapping_s_gaits() -> None:
+    driving = Driving(1.0, 1.0, 1.0, ("trot", "pace"))
+    assert [driving.next_gait() for _ in range(3)] == ["pace", "trot", "pace"]
 
 
 def test_standing_up_arms_only_with_the_dead_man_held() -> None:
@@ -258,6 +297,100 @@ def test_buttons_stand_it_up_and_sticks_walk_it_once_they_were_centred(tmp_path:
 
     said = _serve_and_drive(tmp_path, fifo, script)
     assert any(words.startswith("walk: ") for words in said)
+
+
+def test_a_leans_the_standing_body_and_the_gait_button_changes_the_gait(tmp_path: Path, fifo: tuple[Path, int]) -> None:
+    async def script(served: Served, fd: int) -> None:
+        tick = served.daemon.cycle.tick
+        os.write(fd, CENTRED + button(BUMPER) + button(308) + REPORT)
+        await served.reach(Mode.STAND)
+        await asyncio.sleep(0.5)  # the joystick hears of it
+        os.write(fd, button(304) + REPORT)
+        await asyncio.sleep(0.2)
+        os.write(fd, axis(TURN, 32767) + axis(RISE, 32767) + REPORT)  # right, and down
+        await _until(lambda: tick["tuned_body_pose"][0, 0] > 0.2 and tick["tuned_body_pose"][0, 3] < -0.05)
+        os.write(fd, axis(TURN, 0) + axis(RISE, 0) + button(304) + button(310) + REPORT)
+        await _until(lambda: not tick["tuned_body_pose"].any())
+        await _until(lambda: tick["tuned_gait_offset"][0].tolist() == [0.75, 0.25, 0.0, 0.5])
+
+    said = _serve_and_drive(tmp_path, fifo, script)
+    assert "the sticks move the body" in said and any(words.startswith("gait walk: gait = walk") for words in said)
+
+
+def test_a_pad_that_is_pulled_out_makes_a_walking_robot_stand_and_nothing_moves_when_it_is_back(tmp_path: Path) -> None:
+    path = tmp_path / "event0"
+
+    def plug() -> int:
+        os.mkfifo(path)
+        return os.open(path, os.O_RDWR)
+
+    async def play() -> None:
+        async with Served(make_config(), tmp_path) as served:
+            done = asyncio.Event()
+            fd = plug()
+            driver = asyncio.get_running_loop().create_task(served.client(lambda s: drive(s, path, done)))
+            try:
+                os.write(fd, CENTRED + button(BUMPER) + button(308) + REPORT)
+                await served.reach(Mode.STAND)
+                os.write(fd, button(B))
+                await served.reach(Mode.WALK)
+                await asyncio.sleep(0.2)
+                os.write(fd, axis(FORWARD, -32768) + REPORT)
+                await _until(lambda: _asked(served) == [0.5, 0.0, 0.0])
+                path.unlink()
+                os.close(fd)  # the last writer: the pad is gone
+                await served.reach(Mode.STAND)
+                fd = plug()
+                os.write(
+                    fd, axis(FORWARD, -32768) + axis(TURN, 0) + axis(LEFT, 0) + button(BUMPER) + button(B) + REPORT
+                )
+                await served.reach(Mode.WALK)
+                await asyncio.sleep(0.3)
+                assert _asked(served) == [0.0, 0.0, 0.0], "the stick was pushed all the time"
+                os.close(fd)
+            finally:
+                done.set()
+                await driver
+
+    asyncio.run(play())
+
+
+def test_after_a_silent_network_the_sticks_have_to_be_centred(tmp_path: Path) -> None:
+    def say(forward: float) -> Callable[[Station], None]:
+        payload = json.dumps({"linear": [forward, 0.0], "yaw_rate": 0.0, "sticks": True})
+        return lambda station: station.session.put(station.keys.velocity, payload)
+
+    async def play() -> None:
+        async with Served(make_config(command__stand_after=60.0), tmp_path) as served:
+            await served.walk()
+            tick = served.daemon.cycle.tick
+
+            async def talk(station: Station, forward: float, seconds: float) -> None:
+                for _ in range(round(seconds / 0.02)):
+                    say(forward)(station)
+                    await asyncio.sleep(0.02)
+
+            with ExitStack() as stack:
+                link = connected(served.config.robot.name, served.config.link.listen[0])
+                station = await asyncio.to_thread(stack.enter_context, link)
+                await talk(station, 0.0, 0.2)
+                await talk(station, 0.3, 0.2)
+                await _until(lambda: _asked(served) == [0.3, 0.0, 0.0])
+                await _until(lambda: bool(tick["clamps"][0] & Clamp.EXPIRED))  # nobody says anything
+                await talk(station, 0.3, 0.3)
+                assert _asked(served) == [0.0, 0.0, 0.0] and served.daemon.cycle.state.mode is Mode.WALK
+                assert served.daemon.link.entrance.refused["command/velocity"] > 0
+                await talk(station, 0.0, 0.1)
+                await talk(station, 0.3, 0.2)
+                assert _asked(served) == [0.3, 0.0, 0.0]
+
+    asyncio.run(play())
+
+
+@pytest.mark.parametrize("robot", ["stoch3", "a1", "mini_cheetah", "stoch3-socketcan"])
+def test_a_silent_driver_s_command_ends_within_a_quarter_of_a_second_on_every_shipped_robot(robot: str) -> None:
+    made = config.load(config.find_robot(robot))
+    assert made.command.expiry + 2.0 / made.control.rate_hz <= 0.25
 
 
 def test_a_refusal_is_shown_with_its_reason(tmp_path: Path, fifo: tuple[Path, int]) -> None:
