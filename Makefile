@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run run-wire test test-service check torture bench format clean
+.PHONY: run run-wire test test-service test-extras check torture bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
@@ -25,6 +25,9 @@ test-service: $(VENV)/.dev
 
 torture: $(VENV)/.dev
 	@$(BIN)/python tests/torture.py $(ARGS)
+
+test-extras: $(VENV)/.extras
+	$(BIN)/pytest tests/test_training_ray.py tests/test_training_rl.py $(PYTEST_ARGS)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -53,6 +56,11 @@ $(VENV)/.sim: $(BIN)/python pyproject.toml constraints.txt
 $(VENV)/.dev: $(VENV)/.sim
 	@echo "installing trotd[dev] into $(VENV) (once) ..."
 	@$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+$(VENV)/.extras: $(VENV)/.dev
+	@echo "installing trotd[ray,rl] into $(VENV) (once; PyTorch is large) ..."
+	@$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[ray,rl]'
 	@touch $@
 
 clean:

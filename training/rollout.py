@@ -121,17 +121,20 @@ def standing_command(measurement: Measurement, world: World) -> JointCommand:
 class Stage:
     """Where a worker plays its episodes: one World and one Controller, used again and again."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: Setup, walker: Walker | None = None) -> None:
+        """Build both; ``walker`` plays in the place of the setup's policy, and tasks then bring no numbers."""
         control = setup.config.control
         self.setup = setup
         self.world = World(setup.config.robot, control.rate_hz, control.gait.walking_height, setup.physics_rate_hz)
-        self._controller = Controller(setup.config.robot, control, setup.policy)
+        self._controller = Controller(setup.config.robot, control, setup.policy) if walker is None else None
+        self._walker: Walker = self._controller or walker  # type: ignore[assignment]
         self._lowest = LOWEST * control.gait.walking_height
         self._weight = setup.config.robot.mass * 9.81
 
     def rollout(self, task: Task) -> Episode:
         """Play one episode; its result depends on the task alone."""
-        set_parameters(self._controller.policy_record, self.setup.policy, task.parameters)
+        if self._controller is not None:
+            set_parameters(self._controller.policy_record, self.setup.policy, task.parameters)
         reward = self.setup.reward
         if isinstance(reward, TableReward):
             return self._imitate(task, reward)
@@ -152,7 +155,7 @@ class Stage:
         features = self.setup.features
         assert features is not None, "Table I compares with a reference"
         table, sums = reward.table(), np.zeros(len(TABLE_TERMS))
-        world, record, lowest = self.world, self._controller.record, self._lowest
+        world, record, lowest = self.world, self._walker.record, self._lowest
         ground, start_yaw = task.conditions.scenario.terrain, task.conditions.scenario.rpy[2]
 
         def watch(tick: int, _: Array) -> bool:
@@ -168,7 +171,7 @@ class Stage:
 
     def _serve(self, task: Task, reward: TaskReward) -> Episode:
         table, sums, smoothed = reward.table(), np.zeros(len(TASK_TERMS)), np.zeros(3)
-        world, geometry = self.world, self._controller.geometry
+        world, geometry = self.world, self._walker.geometry
         dt, height = world.period, self.setup.config.control.gait.walking_height
         ground = task.conditions.scenario.terrain
 
@@ -185,5 +188,5 @@ class Stage:
         return self._play(task, watch, TASK_TERMS, sums)
 
     def _play(self, task: Task, watch: Watch, names: tuple[str, ...], sums: Array) -> Episode:
-        steps, fell = walk(self.world, self._controller, task.conditions, self._commands(task.conditions), watch)
+        steps, fell = walk(self.world, self._walker, task.conditions, self._commands(task.conditions), watch)
         return Episode(float(sums.sum()), steps, fell, named(names, sums))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trotd import cli_bench, cli_hardware, cli_live, cli_ros2, cli_station, cli_training
+from trotd import cli_bench, cli_hardware, cli_live, cli_ros2, cli_station, cli_study, cli_training
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -232,6 +232,7 @@ cli_station.register(app)
 cli_live.register(app)
 cli_ros2.register(app)
 cli_training.register(app)
+cli_study.register(app)
 cli_bench.register(app)
 
 

@@ -33,7 +33,8 @@ def register(app: typer.Typer) -> None:
 
 
 @contextlib.contextmanager
-def _one_line_errors() -> Iterator[None]:
+def one_line_errors() -> Iterator[None]:
+    """Whatever is wrong with what was asked leaves as one line and a code."""
     from msgspec import ValidationError
 
     from runtime.config import ConfigError
@@ -83,7 +84,7 @@ def train(
 
     Example: `trotd train --seed 1`
     """
-    with _one_line_errors():
+    with one_line_errors():
         from training.checkpoint import RunFolder
         from training.provenance import config_hash, versions
 
@@ -202,7 +203,7 @@ def evaluate(
 
     Example: `trotd evaluate trot --controller mpc --baseline zero --page trot.html`
     """
-    with _one_line_errors():
+    with one_line_errors():
         config, beside = _load(robot)
         names = [*(contenders or []), *(controller or []), *(baseline or [])] or [config.control.policy]
         text = _show_table(config, names, workers, quick, rough, only, json, beside)
@@ -266,7 +267,7 @@ def show(
     policy: Annotated[str, typer.Argument(help="A policy file or a shipped one's name.")], robot: RobotOption = "stoch3"
 ) -> None:
     """The matrix in physical units: what drives what, symmetry, worst case, a dead contact sensor."""
-    with _one_line_errors():
+    with one_line_errors():
         from training.inspection import describe
 
         typer.echo(describe(_policy(policy, robot)))
@@ -279,7 +280,7 @@ def diff(
     robot: RobotOption = "stoch3",
 ) -> None:
     """Where two policies differ most, in physical units."""
-    with _one_line_errors():
+    with one_line_errors():
         from training.inspection import compare
 
         try:
