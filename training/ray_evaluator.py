@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Sequence
 from typing import Any
 
 from training.evaluators import ATTEMPTS, LOST, attempt
 from training.rollout import Episode, Setup, Stage, Task
+
+KNOCK = 5.0
+"""s that a cluster has to answer."""
 
 
 class ClusterError(ConnectionError):
@@ -38,6 +42,7 @@ class RayCluster:
             from ray.util import ActorPool
         except ImportError as error:
             raise ClusterError("Ray is not installed: pip install 'trotd[ray]'") from error
+        _knock(address)
         try:
             ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
         except (ConnectionError, ValueError, RuntimeError) as error:
@@ -45,9 +50,9 @@ class RayCluster:
         self._ray: Any = ray
         environment = {"env_vars": {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}}
         remote = ray.remote(num_cpus=1, max_restarts=-1, max_task_retries=ATTEMPTS, runtime_env=environment)(_Actor)
-        shared = ray.put(setup)
+        self._shared = ray.put(setup)  # held: an actor that is restarted asks for it again
         self.workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
-        self._actors = [remote.remote(shared) for _ in range(self.workers)]
+        self._actors = [remote.remote(self._shared) for _ in range(self.workers)]
         self._pool: Any = ActorPool(self._actors)
 
     def evaluate(self, tasks: Sequence[Task]) -> list[Episode]:
@@ -67,3 +72,14 @@ class RayCluster:
         for actor in self._actors:
             self._ray.kill(actor)
         self._ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Ray itself would try for minutes where nobody is."""
+    host, _, port = address.rpartition(":")
+    if not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), KNOCK).close()
+    except OSError as error:
+        raise ClusterError(f"no Ray cluster at {address!r}: {error.strerror or error}") from error
