@@ -100,7 +100,11 @@ def rules(robot: str) -> dict[str, Any]:
     everything = f"{keys.root}/**"
     seeing = [
         _rule("see", _LISTENING, [everything]),
-        _rule("ask", ["query"], [keys.tick_schema, keys.event, keys.recording, keys.policies, keys.tuning]),
+        _rule(
+            "ask",
+            ["query"],
+            [keys.tick_schema, keys.event, keys.recording, keys.policies, keys.tuning, keys.faults],
+        ),
     ]
     driving = [
         _rule("steer", ["put"], [keys.velocity, keys.pose]),

@@ -15,9 +15,11 @@ from drivers.description import Record, RobotDescription
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
 from runtime.control.parameters import ControlConfig
 from runtime.parameters import (
+    ArmingConfig,
     AuditionConfig,
     CommandConfig,
     DampConfig,
+    DegradeConfig,
     LimitsConfig,
     LinkConfig,
     PostureConfig,
@@ -40,6 +42,8 @@ class Config(Record, frozen=True, kw_only=True):
     robot: RobotDescription
     control: ControlConfig
     limits: LimitsConfig = LimitsConfig()
+    arming: ArmingConfig = ArmingConfig()
+    degrade: DegradeConfig = DegradeConfig()
     posture: PostureConfig = PostureConfig()
     command: CommandConfig = CommandConfig()
     damp: DampConfig = DampConfig()
@@ -144,6 +148,15 @@ def _contradictions(config: Config) -> Iterator[str]:
             f"limits.arming_temperature = {limits.arming_temperature}:"
             f" must not pass max_temperature = {limits.max_temperature}"
         )
+    if config.degrade.thermal_start >= limits.max_temperature:
+        yield (
+            f"degrade.thermal_start = {config.degrade.thermal_start}:"
+            f" must be below limits.max_temperature = {limits.max_temperature}"
+        )
+    if 0.0 < config.degrade.voltage_start <= limits.min_voltage:
+        yield f"degrade.voltage_start = {config.degrade.voltage_start}: must pass limits.min_voltage"
+    if limits.stall_stand > limits.stall_damp:
+        yield f"limits.stall_stand = {limits.stall_stand}: must not pass stall_damp = {limits.stall_damp}"
     if not config.link.allow_unprotected:
         for endpoint in config.link.listen:
             if not _loopback(endpoint) and not (config.link.certificates and endpoint.startswith("tls/")):

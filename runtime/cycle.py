@@ -7,55 +7,35 @@ calls it on the robot, tests and replays call it on anything.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.robot import Array, JointCommand, Measurement, damp_command
-from runtime import modes
+from drivers.robot import Array, JointCommand, Measurement
+from runtime import keyframe, modes
+from runtime.arming import Arming
 from runtime.config import Config
 from runtime.control.controller import Controller, alike
 from runtime.control.policy import Policy
-from runtime.control.posture import POSTURE_DTYPE, Posture, blend, minimum_jerk
 from runtime.control.records import CONTROL_DTYPE, Clamp, Records, SolverStatus, VelocityCommand
-from runtime.control.state import STATE_DTYPE
-from runtime.limits import Guard
-from runtime.messages import CONTROL_OFFSET, TICK_DTYPE, TUNED, Event, Mode, Request
-from runtime.modes import Answer, ModeState, Reason
+from runtime.guard import Guard
+from runtime.keyframe import KEYFRAME_DTYPE
+from runtime.messages import CONTROL_OFFSET, TICK_DTYPE, TUNED, ArmingCheck, Event, Evidence, Mode, Request
+from runtime.modes import Answer, ModeState, Reaction, Reason
+from runtime.sources import COMMAND_FIELDS, Sources
+
+__all__ = ["EVENTS", "KEYFRAME_DTYPE", "Cycle", "Fault", "Wake"]
 
 EVENTS = 256
 """Events that wait for the link at most; the oldest go first."""
 
 _DAMP, _STAND_UP, _STAND, _WALK, _SIT_DOWN = Mode  # an enum's attribute costs a microsecond before Python 3.12
-_OK, _NOT_FINITE, _SOLVER_FAILED = Reason.OK, Reason.NOT_FINITE, Reason.SOLVER_FAILED
+_OK, _SOLVER_FAILED, _OPERATOR_LOST = Reason.OK, Reason.SOLVER_FAILED, Reason.OPERATOR_LOST
 _FAILED = int(SolverStatus.FAILED)
-_EXPIRED = int(Clamp.EXPIRED)
-_COMMAND_FIELDS = ("position", "velocity", "kp", "kd", "torque")
+_DEADMAN = int(Clamp.DEADMAN)
 _PLAN_FIELDS = ("velocity_command", "observation", "asked", "action", "phase", "stance", "touchdown", "foot_targets")
 _BLANK_FIELDS = (*_PLAN_FIELDS, "target_wrench", "grf", "solver_status", "clamps")
-
-
-KEYFRAME_DTYPE = np.dtype(
-    [
-        ("index", "u8"),  # of the tick at whose end it was taken
-        ("control", STATE_DTYPE),
-        ("posture", POSTURE_DTYPE),
-        ("mean_square", "f8", (4, 3)),
-        ("command", "f8", (5, 4, 3)),
-        ("blend_from", "f8", (5, 4, 3)),
-        ("blend_left", "f8"),
-        ("velocity", "f8", (3,)),
-        ("velocity_stamp", "f8"),
-        ("mode", "u1"),
-        ("armed", "u1"),
-        ("reason", "u2"),
-        ("fault", "u2"),
-        ("verdict", "u2"),
-    ],
-    align=True,
-)
-"""What a cycle remembers from tick to tick: with it a replay can begin in the middle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +53,17 @@ class Wake:
     """Since the start."""
 
 
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault that has just begun to stand."""
+
+    tick: int
+    mode: Mode
+    """What the robot did when it came."""
+    led_to: Mode
+    evidence: Evidence
+
+
 class Cycle:
     """One robot's mode, its sources of commands and the record of the tick."""
 
@@ -86,8 +77,14 @@ class Cycle:
         self.tick = np.zeros(1, TICK_DTYPE)
         """The record of this tick. Shape (1,)."""
         self.state = ModeState()
+        self.verdict = Reason.NOT_READY
+        """Of the guard on the last measurement."""
+        self.evidence: Evidence | None = None
+        """Of the fault that stands."""
         self.events: deque[Event] = deque(maxlen=EVENTS)
         """What happened and was not yet told."""
+        self.faults: deque[Fault] = deque(maxlen=EVENTS)
+        """Faults that were not yet kept."""
         self.generation = 1
         """Number of policies that were active so far."""
         self.outgoing = 0
@@ -96,22 +93,29 @@ class Cycle:
         """How often each clamp acted."""
         self.solver = [0] * len(SolverStatus)
         """How often each solver status came, in ticks that stepped the controller."""
+        self.checks: tuple[ArmingCheck, ...] = ()
+        """The arming list of the last request to arm."""
+        self.outside: Callable[[], Sequence[ArmingCheck]] = tuple
+        """Checks of the arming list that only the shell can make."""
         control = self.tick.view(np.uint8)[CONTROL_OFFSET:].view(CONTROL_DTYPE)
         self.controller = Controller(config.robot, config.control, policy, control)
-        self.guard = Guard(config.robot, config.limits, config.control.rate_hz)
-        self.posture = Posture(config.robot, config.control, config.posture)
-        self._damp = damp_command(config.damp.kd)
-        self._command = self._damp
-        self._blend_from = self._damp
-        self._blend_left = 0.0
-        self._velocity = VelocityCommand()
-        self._rest = VelocityCommand()
-        self._verdict = Reason.NOT_READY
-        self._problems: Sequence[str] = ()
+        self.sources = Sources(config, self.controller)
+        self.guard = Guard(
+            config.robot,
+            config.limits,
+            config.control.rate_hz,
+            config.degrade,
+            config.posture.soft_start,
+            config.control.bounds,
+        )
+        posture = self.sources.posture
+        self.arming = Arming(
+            config.robot, config.limits, config.arming, (posture.folded_joints, posture.standing_joints)
+        )
         self._row = self.tick[0]  # a view: what is written into it is in the record
         self._views = {name: self.tick[name][0] for name in TICK_DTYPE.names or () if self.tick[name].ndim > 1}
         self._tuned = self.tick.view(np.float64)[TUNED]
-        self._command_views = tuple(self._views[f"command_{name}"] for name in _COMMAND_FIELDS)
+        self._command_views = tuple(self._views[f"command_{name}"] for name in COMMAND_FIELDS)
 
     @property
     def policy(self) -> Policy:
@@ -121,7 +125,7 @@ class Cycle:
     @property
     def health(self) -> str:
         """What the guard says of the last measurement; empty when all is in order."""
-        return "" if self._verdict is _OK else self.guard.explain(self._verdict, self.tick)
+        return "" if self.verdict is _OK else self.guard.explain(self.verdict)
 
     def swap_policy(self, policy: Policy, share: float = 1.0) -> None:
         """Take another policy, between two ticks; below a ``share`` of one the policy before has the rest.
@@ -139,7 +143,7 @@ class Cycle:
         if not kin:
             self.controller.state["remembered"] = 0
             if self.state.mode is _STAND or self.state.mode is _WALK:
-                self._blend_from, self._blend_left = self._command, self.config.posture.blend_time
+                self.sources.hand_over()
         self.generation += 1
         self.note("policy", f"{policy.name} is active")
 
@@ -157,99 +161,101 @@ class Cycle:
 
     def warm_up(self, measurement: Measurement) -> None:
         """Run every path of a tick once, so that nothing compiles later; leaves the state as it was."""
+        posture = self.sources.posture
         self.guard.reset()
         self.controller.warm_up(measurement)
-        self.posture.stand_up(measurement)
-        self.posture.step()
-        self.posture.reset()
+        posture.stand_up(measurement)
+        posture.step()
+        posture.reset()
         self.tick[:] = 0
 
     def step(self, wake: Wake, measurement: Measurement) -> JointCommand:
         """From a measurement to the command that acts from the next exchange on."""
         self._begin(wake)
         self._note_measurement(measurement)
-        self._verdict = self.guard.judge(self.tick)
-        walk_lost = wake.stamp - self._velocity.stamp > self.config.command.stand_after
+        self.verdict = verdict = self.guard.judge(self.tick)
+        carried = self.guard.carried_imu()
+        if carried is not None:
+            measurement = Measurement(measurement.stamp, carried, measurement.joints, measurement.voltage)
+        sources = self.sources
+        walk_lost = wake.stamp - sources.velocity.stamp > self.config.command.stand_after
         before = self.state
-        self.state = modes.advance(before, self._verdict, self.posture.finished, walk_lost)
+        answer = self.guard.reaction(verdict) if verdict is not _OK else Reaction.NONE
+        self.state = modes.advance(before, verdict, sources.posture.finished, walk_lost, answer)
         self._changed(before, measurement)
-        command = self._bounded(self._source(wake, measurement), measurement)
+        command = sources.step(
+            self.state.mode, wake.stamp, measurement, self.guard.imu_believed, self.guard.speed_share
+        )
+        command = self._bounded(command, measurement)
         self._note_command(command)
         return command
 
     def silent(self, wake: Wake, words: str) -> JointCommand:
         """A tick whose exchange brought nothing back: damp, and say so."""
         self._begin(wake)
-        self._verdict = Reason.BODY_SILENT
-        self._fail(Reason.BODY_SILENT, words)
-        self._note_command(self._damp)
-        return self._damp
+        self.verdict = Reason.BODY_SILENT
+        self._fail(Reason.BODY_SILENT, None, words)
+        self.guard.skip()
+        self.sources.marks = 0
+        command = self.sources.limp()
+        self._write(command)
+        self._note_command(command)
+        return command
 
     def request(self, wish: Request, measurement: Measurement | None) -> tuple[Answer, str]:
         """Answer the operator between two ticks; the words name every obstacle."""
         before = self.state
-        problems = self.guard.arming_problems(self.tick) if wish is Request.ARM and measurement is not None else []
+        ready = True
+        if wish is Request.ARM and measurement is not None:
+            self.checks = self.examine()
+            ready = all(check.ok for check in self.checks)
         settled = bool(self._views["stance"].all())
-        answer = modes.request(before, wish, self._verdict, not problems, settled)
+        answer = modes.request(before, wish, self.verdict, ready, settled)
         self.state = answer.state
         words = answer.reason.words
-        if answer.reason is Reason.NOT_READY:
-            words = "; ".join(problems) or words
+        if answer.reason is Reason.NOT_READY and not ready:
+            words = "; ".join(check.words for check in self.checks if not check.ok)
         elif answer.reason.is_fault:
-            words = self.guard.explain(answer.reason, self.tick)
+            words = self.guard.explain(answer.reason)
         if not answer.accepted:
             self.note("refused", f"{wish.value}: {words}")
         if measurement is not None:
             self._changed(before, measurement)
         return answer, words
 
+    def examine(self) -> tuple[ArmingCheck, ...]:
+        """The arming list as it is now."""
+        now = float(self._row["stamp"])
+        velocity = self.sources.velocity
+        if now - velocity.stamp > self.config.command.stand_after:
+            velocity = self.sources.rest
+        own = self.arming.examine(self.tick, self.guard, self.verdict, self.policy, velocity, now)
+        return (*own, *self.outside())
+
+    def lose_operator(self, measurement: Measurement | None) -> None:
+        """The driver has gone: a walking robot stands."""
+        before = self.state
+        self.state = modes.lose_operator(before)
+        if measurement is not None:
+            self._changed(before, measurement)
+
     def command_velocity(self, command: VelocityCommand) -> None:
         """Take the newest velocity command; it counts from its stamp."""
-        self._velocity = command
+        self.sources.velocity = command
 
     def damp(self, reason: Reason) -> None:
         """Damp and disarm for a reason of the daemon's own."""
         before = self.state
         self.state = ModeState(Mode.DAMP, False, reason, before.fault)
-        self._enter(before)
+        self._enter(before, None)
 
     def remember(self) -> Records:
         """All that the next tick depends on beside this tick's record. Shape (1,) of ``KEYFRAME_DTYPE``."""
-        keyframe = np.zeros(1, KEYFRAME_DTYPE)
-        k, state = keyframe[0], self.state
-        k["index"], k["control"], k["mean_square"] = (
-            self._row["index"],
-            self.controller.state[0],
-            self.guard.mean_square,
-        )
-        for key, command in (("command", self._command), ("blend_from", self._blend_from)):
-            for row, name in enumerate(_COMMAND_FIELDS):
-                k[key][row] = getattr(command, name)
-        k["blend_left"], k["velocity_stamp"] = self._blend_left, self._velocity.stamp
-        k["velocity"][:2], k["velocity"][2] = self._velocity.linear, self._velocity.yaw_rate
-        k["mode"], k["armed"], k["reason"] = int(state.mode), state.armed, int(state.reason)
-        k["fault"], k["verdict"] = int(state.fault), int(self._verdict)
-        self.posture.remember(k["posture"])
-        return keyframe
+        return keyframe.remember(self)
 
-    def recall(self, keyframe: Records, tick: Records) -> None:
-        """Be as after the tick ``tick`` (1,), at whose end ``keyframe`` (1,) was remembered."""
-        k = keyframe[0]
-        self.tick[:] = tick
-        self.controller.state[:] = keyframe["control"]
-        self.guard.mean_square[:] = k["mean_square"]
-        self._command = JointCommand(*k["command"].copy())
-        self._blend_from = JointCommand(*k["blend_from"].copy())
-        self._blend_left = float(k["blend_left"])
-        velocity = k["velocity"].copy()
-        self._velocity = VelocityCommand(float(k["velocity_stamp"]), velocity[:2], float(velocity[2]))
-        self.state = ModeState(
-            Mode(int(k["mode"])), bool(k["armed"]), Reason(int(k["reason"])), Reason(int(k["fault"]))
-        )
-        self._verdict = Reason(int(k["verdict"]))
-        self.generation, self.outgoing = int(self._row["policy"]), int(self._row["outgoing"])
-        self.tune(self._tuned)
-        self.posture.recall(k["posture"])
+    def recall(self, memory: Records, tick: Records) -> None:
+        """Be as after the tick ``tick`` (1,), at whose end ``memory`` (1,) was remembered."""
+        keyframe.recall(self, memory, tick)
 
     def note(self, kind: str, text: str) -> None:
         """Add an event."""
@@ -277,54 +283,41 @@ class Cycle:
         views["joint_fault"][:] = joints.fault
         views["joint_age"][:] = joints.age
 
-    def _source(self, wake: Wake, measurement: Measurement) -> JointCommand:
-        """This mode's command, before bounds."""
-        mode = self.state.mode
-        if mode is _DAMP:
-            if self._verdict is not _NOT_FINITE:
-                self.controller.estimate(measurement)
-            return self._damp
-        if mode is _STAND_UP or mode is _SIT_DOWN:
-            self.controller.estimate(measurement)
-            return self._blended(self.posture.step())
-        if mode is _STAND:
-            command = self.controller.step(measurement, self._rest, True)
-        else:
-            command = self._walk(wake.stamp, measurement)
-        self.solver[int(self._row["solver_status"])] += 1
-        return self._blended(command)
-
-    def _walk(self, now: float, measurement: Measurement) -> JointCommand:
-        """Follow the newest command, or rest once it is too old; the controller bounds how fast it follows."""
-        expired = now - self._velocity.stamp > self.config.command.expiry
-        command = self.controller.step(measurement, self._rest if expired else self._velocity, False)
-        if expired:
-            self._velocity = VelocityCommand(stamp=self._velocity.stamp)
-            self._row["clamps"] = int(self._row["clamps"]) | _EXPIRED
-        return command
-
-    def _blended(self, command: JointCommand) -> JointCommand:
-        if self._blend_left <= 0.0:
-            return command
-        self._blend_left -= 1.0 / self.config.control.rate_hz
-        share = minimum_jerk(1.0 - self._blend_left / self.config.posture.blend_time)
-        return blend(self._blend_from, command, share)
-
     def _bounded(self, command: JointCommand, measurement: Measurement) -> JointCommand:
-        """The command with its torque cut, or damp when it cannot be trusted."""
+        """The command with its torque cut; or, when it cannot be trusted, one that gives up."""
         mode = self.state.mode
         if mode is _DAMP:
-            return self._damp
-        if (mode is _STAND or mode is _WALK) and int(self._row["solver_status"]) == _FAILED:
-            self._fail(_SOLVER_FAILED, _SOLVER_FAILED.words)
-            return self._damp
-        self._write(command)
-        reason = self.guard.bound(self.tick)
+            self._write(command)
+            return command
+        reason = _OK
+        if mode is _STAND or mode is _WALK:
+            status = int(self._row["solver_status"])
+            self.solver[status] += 1
+            reason = self.guard.judge_policy(self.tick)
+            if reason is _OK and status == _FAILED:
+                reason = _SOLVER_FAILED
+        if reason is _OK:
+            self._write(command)
+            reason = self.guard.bound(self.tick)
         if reason is not _OK:
-            self._fail(reason, reason.words)
-            return self._damp
-        torque = self._command_views[4].copy()
-        return JointCommand(command.position, command.velocity, command.kp, command.kd, torque)
+            return self._give_up(reason, measurement)
+        return JointCommand(command.position, command.velocity, command.kp, command.kd, self._command_views[4].copy())
+
+    def _give_up(self, reason: Reason, measurement: Measurement) -> JointCommand:
+        """Sit down instead of the command that cannot be trusted, or damp."""
+        self._fail(reason, measurement)
+        sources = self.sources
+        if self.state.mode is _SIT_DOWN:
+            command = sources.step(_SIT_DOWN, 0.0, measurement, False, 1.0)
+            self._write(command)
+            reason = self.guard.bound(self.tick)
+            if reason is _OK:
+                torque = self._command_views[4].copy()
+                return JointCommand(command.position, command.velocity, command.kp, command.kd, torque)
+            self._damp_for(reason)
+        command = sources.limp()
+        self._write(command)
+        return command
 
     def _write(self, command: JointCommand) -> None:
         position, velocity, kp, kd, torque = self._command_views
@@ -332,58 +325,65 @@ class Cycle:
         kd[:], torque[:] = command.kd, command.torque
 
     def _note_command(self, command: JointCommand) -> None:
-        if command is self._damp:
-            self._write(command)
-        row, state = self._row, self.state
+        row, state, sources = self._row, self.state, self.sources
         row["mode"], row["armed"], row["reason"] = int(state.mode), state.armed, int(state.reason)
-        asked = self._velocity if state.mode is _WALK else self._rest
+        asked = sources.velocity if state.mode is _WALK else sources.rest
         vector = self._views["asked_velocity"]
         vector[:2], vector[2] = asked.linear, asked.yaw_rate
-        bits = int(row["clamps"])
+        bits = int(row["clamps"]) | self.guard.marks | sources.marks
+        if state.reason is _OPERATOR_LOST and state.mode is _STAND:
+            bits |= _DEADMAN
+        row["clamps"] = bits
         while bits:
             lowest = bits & -bits
             self.clamps[lowest.bit_length() - 1] += 1
             bits ^= lowest
-        self._command = command
+        self.guard.keep_command(self.tick)
+        sources.command = command
 
-    def _fail(self, reason: Reason, words: str) -> None:
-        """Damp for ``reason``; an armed robot keeps it as the fault that stands."""
+    def _fail(self, reason: Reason, measurement: Measurement | None, words: str = "") -> None:
+        """Give up for ``reason``; an armed robot keeps it as the fault that stands."""
         before = self.state
-        self.state = modes.advance(before, reason, False, False)
+        answer = self.guard.reaction(reason)
+        self.state = modes.advance(before, reason, False, False, answer)
         if self.state is not before:
-            self.note("fault", words)
-            self._enter(before)
+            self._stand_fault(before, words)
+            self._enter(before, measurement)
+
+    def _damp_for(self, reason: Reason) -> None:
+        before = self.state
+        self.state = modes.advance(before, reason, False, False, Reaction.DAMP)
+        self._enter(before, None)
 
     def _changed(self, before: ModeState, measurement: Measurement) -> None:
         """Tell of a change of state and make its new mode ready."""
         if self.state == before:
             return
-        if self.state.reason.is_fault and self.state.fault is not before.fault:
-            self.note("fault", self.guard.explain(self.state.reason, self.tick))
-        self._enter(before)
-        if self.state.mode is before.mode:
-            return
-        match self.state.mode:
-            case Mode.STAND_UP:
-                self.posture.stand_up(measurement)
-            case Mode.SIT_DOWN:
-                self.posture.sit_down(measurement, bearing=before.mode is Mode.STAND)
-            case Mode.STAND if before.mode is Mode.STAND_UP:
-                self.controller.reset(measurement)
-            case Mode.WALK:
-                self._velocity = VelocityCommand(stamp=float(self.tick["stamp"][0]))
+        if self.state.fault is not before.fault:
+            self._stand_fault(before)
+        self._enter(before, measurement)
 
-    def _enter(self, before: ModeState) -> None:
+    def _stand_fault(self, before: ModeState, words: str = "") -> None:
+        """Keep the evidence of the fault that begins to stand, or forget that of the one that was cleared."""
+        fault = self.state.fault
+        if fault is _OK:
+            self.evidence = None
+            return
+        evidence = self.guard.evidence(fault)
+        if words:
+            evidence = Evidence(reason=evidence.reason, words=words)
+        self.evidence = evidence
+        self.note("fault", evidence.words)
+        self.faults.append(Fault(int(self._row["index"]), before.mode, self.state.mode, evidence))
+
+    def _enter(self, before: ModeState, measurement: Measurement | None) -> None:
         """What every change of mode or arming does."""
         state = self.state
         if state.mode is not before.mode:
             self.note("mode", f"{before.mode.name} -> {state.mode.name}: {state.reason.words}")
-            self._blend_from, self._blend_left = self._command, self.config.posture.blend_time
             for name in _BLANK_FIELDS:
                 self.tick[name] = 0
-            if state.mode is Mode.DAMP or before.mode is Mode.DAMP:
-                self._blend_left = 0.0
-            if state.mode is Mode.DAMP:
-                self.posture.reset()
+            now = float(self._row["stamp"])
+            self.sources.change(before.mode, state.mode, measurement, state.reason.is_fault, now)
         elif state.armed != before.armed or state.fault is not before.fault:
             self.note("mode", f"{state.mode.name}: {state.reason.words}")

@@ -26,11 +26,13 @@ from runtime.control.policy import Policy
 from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle, Wake
 from runtime.doors import Channel, Outcome
+from runtime.faults import FaultHistory, fault_file
 from runtime.flight_log import FlightLog
 from runtime.link import Link
 from runtime.messages import (
+    ArmingCheck,
+    FaultRecord,
     Keys,
-    Mode,
     ModeReply,
     PolicyEntry,
     PoseMessage,
@@ -72,6 +74,8 @@ class Job:
     """The body is none that could break."""
     memory: Path | None = None
     """Where the ring of ticks lies: a folder that is kept in RAM spares the disk. Without one, the state folder."""
+    checks: Callable[[], Sequence[ArmingCheck]] = field(default=tuple)
+    """What the body itself adds to the arming list."""
 
 
 class Daemon:
@@ -87,6 +91,7 @@ class Daemon:
         memory = (job.memory or job.folder / "memory") / name
         self.flight = FlightLog(job.config, job.robot_toml, job.folder / "recordings" / name, memory, self.cycle)
         self.shelf = Shelf(self.cycle, job.folder, name, self.flight.take_policy)
+        self.history = FaultHistory(fault_file(job.folder, name))
         self.audition = Audition(self.cycle, self.shelf, job.config.audition)
         self.tuning = Tuning(job.config, self.cycle.controller.tuning, job.folder / "tuning" / f"{name}.json")
         self._compute = np.zeros(max(1, round(job.config.control.rate_hz)))
@@ -140,6 +145,7 @@ class Daemon:
         self.link = Link(self.config, self, self.flight.folder, self.job.channels(keys))
         try:
             self.link.open()
+            self.cycle.outside = self._checks
             yield
         finally:
             self.link.close()
@@ -177,9 +183,10 @@ class Daemon:
             async with asyncio.TaskGroup() as group:
                 sender = group.create_task(self.link.run(), name="link")
                 writer = group.create_task(self.flight.run(), name="recordings")
+                keeper = group.create_task(self.history.run(), name="faults")
                 await self._control(notifier)
-                sender.cancel()
-                writer.cancel()
+                for task in (sender, writer, keeper):
+                    task.cancel()
         finally:
             await self._damp_body()  # before anything that waits for a disk
             notifier.tell("STOPPING=1")
@@ -249,12 +256,18 @@ class Daemon:
         self.audition.stop()
         self._tell_events()
         self.flight.finish()
+        self.history.save()
         self._tell_events()
         self.link.flush()
 
     # What happens between ticks ----------------------------------------------------------------------------------
 
     def _tell_events(self) -> None:
+        while self.cycle.faults:
+            self.history.take(self.cycle.faults.popleft())
+        if self.history.problem:
+            self.cycle.note("faults", f"history: {self.history.problem}")
+            self.history.problem = ""
         while self.cycle.events:
             event = self.cycle.events.popleft()
             self.flight.take_event(event)
@@ -278,13 +291,13 @@ class Daemon:
         """An operator's wish, answered at once."""
         answer, words = self.cycle.request(wish, self.measurement)
         self._tell_events()
-        return ModeReply(answer.accepted, answer.state.mode.name, words)
+        checks = self.cycle.checks if wish is Request.ARM else ()
+        return ModeReply(answer.accepted, answer.state.mode.name, words, checks)
 
     def lose_operator(self) -> None:
         """A driver is gone: a walking robot stands."""
-        if self.cycle.state.mode is Mode.WALK:
-            self.cycle.note("mode", "the operator is gone")
-            self.take_request(Request.STAND)
+        self.cycle.lose_operator(self.measurement)
+        self._tell_events()
 
     def offer_policy(self, file: PolicyFile, immediate: bool, done: Future[Outcome]) -> None:
         """A verified candidate; ``done`` gets what became of it, which may take seconds.
@@ -355,11 +368,23 @@ class Daemon:
         """Write a recording with the next tick."""
         self.flight.ask(reason, done)
 
+    def fault_history(self) -> list[FaultRecord]:
+        """Every fault that stood lately, oldest first, those before this start too."""
+        return self.history.records
+
     def status(self) -> Status:
         """Everything that people want to see."""
         compute = self._compute[: min(len(self._compute), max(1, self.flight.recorder.count))]
         refused = self.link.entrance.refused
         return build_status(self.cycle, self.shelf.active, compute, refused, self.flight.refused)
+
+    def _checks(self) -> tuple[ArmingCheck, ...]:
+        """What the arming list has to say of the operator and of the body."""
+        drivers, needed = len(self.link.entrance.drivers), self.config.arming.require_driver
+        words = f"{drivers} driving" if drivers else "asked for over the link"
+        if needed and not drivers:
+            words = "no driver is there, and arming.require_driver asks for one: trotd joystick"
+        return (ArmingCheck("operator", bool(drivers) or not needed, words), *self.job.checks())
 
 
 def _settle(done: Future[Outcome]) -> Answer:

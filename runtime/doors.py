@@ -24,6 +24,7 @@ from runtime import messages, policies
 from runtime.config import Config
 from runtime.control.records import VelocityCommand
 from runtime.messages import (
+    FaultRecord,
     Keys,
     MessageError,
     ModeReply,
@@ -74,6 +75,7 @@ class Doors(Protocol):
     def active_policy(self) -> PolicyFile: ...  # noqa: D102
     def list_policies(self) -> Callable[[], list[PolicyEntry]]: ...  # noqa: D102
     def refuse(self, door: str, why: str) -> None: ...  # noqa: D102
+    def fault_history(self) -> list[FaultRecord]: ...  # noqa: D102
     def record_now(self, reason: str, done: Future[Path]) -> None: ...  # noqa: D102
     def status(self) -> Status: ...  # noqa: D102
 
@@ -104,6 +106,8 @@ class Entrance:
         self._heard = -math.inf
         self._locked = True
         """The sticks were not centred since commands came again."""
+        self.drivers: set[str] = set()
+        """Liveliness tokens of the drivers that are there."""
 
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Open every door; needs the running loop."""
@@ -121,6 +125,7 @@ class Entrance:
                     (keys.tuning, self._answer_tuning),
                     (keys.change_tuning, self._answer_change),
                     (keys.recording, self._answer_recording),
+                    (keys.faults, self._answer_faults),
                     (keys.tick_schema, lambda _query: messages.tick_schema()),
                 )
             ),
@@ -196,8 +201,12 @@ class Entrance:
 
     def _hear_operator(self, sample: zenoh.Sample) -> None:
         """A driver came or went; one that went, for whatever cause, stops the walk at once."""
+        token = str(sample.key_expr)
         if sample.kind == zenoh.SampleKind.DELETE:
+            self.drivers.discard(token)
             self._cross(self._doors.lose_operator)
+        else:
+            self.drivers.add(token)
 
     def _hearer(self, channel: Channel) -> Callable[[zenoh.Sample], None]:
         accept = channel.accept
@@ -297,6 +306,9 @@ class Entrance:
         reply = PolicyReply(outcome.accepted, active.policy.name, active.sha256, outcome.words, outcome.report)
         with query:
             query.reply(self._keys.policy, msgspec.json.encode(reply))
+
+    def _answer_faults(self, _query: zenoh.Query) -> bytes:
+        return msgspec.json.encode(self._wait(self._doors.fault_history))
 
     def _answer_recording(self, query: zenoh.Query) -> bytes:
         parameters = query.parameters

@@ -18,8 +18,11 @@ from runtime.control.state import TUNING_FIELDS, TUNING_SIZE
 __all__ = [
     "CONTROL_DTYPE",
     "TICK_DTYPE",
+    "ArmingCheck",
     "Clamp",
     "Event",
+    "Evidence",
+    "FaultRecord",
     "Keys",
     "Mode",
     "PolicyEntry",
@@ -111,6 +114,34 @@ CONTROL_OFFSET = TICK_DTYPE.itemsize - CONTROL_DTYPE.itemsize
 """Where the core's part starts inside a tick record, bytes."""
 
 
+class Evidence(msgspec.Struct, frozen=True, kw_only=True):
+    """What the guard holds against a measurement or a command."""
+
+    reason: str
+    """Name of the ``Reason``, in small letters."""
+    words: str
+    """All of it in one line for people."""
+    where: str = ""
+    """A joint, such as ``FL knee``; empty where it concerns the whole robot."""
+    value: float | None = None
+    """What was measured, in ``unit``; None where it was not a number."""
+    bound: float = 0.0
+    unit: str = ""
+
+
+class FaultRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One fault that stood, as the history keeps it."""
+
+    time: str
+    """Local time, ISO 8601."""
+    tick: int
+    mode: str
+    """What the robot did when it came."""
+    led_to: str
+    """The mode it led to."""
+    evidence: Evidence
+
+
 class Status(msgspec.Struct, frozen=True, kw_only=True):
     """The daemon's state for people: JSON, ten times a second and on every change."""
 
@@ -119,6 +150,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     armed: bool
     fault: str
     """The fault that stands until it is cleared; empty for none."""
+    evidence: Evidence | None = None
+    """Of that fault."""
     health: str = ""
     """What the guard says of the last measurement; empty when all is in order."""
     reason: str
@@ -134,6 +167,10 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     rpy: tuple[float, float, float]
     voltage: float
     max_temperature: float
+    speed_share: float = 1.0
+    """Share of the commanded velocity that heat and supply leave."""
+    torque_share: float = 1.0
+    """Share of the peak torque that the most limited motor is given."""
     tick_p50: float
     """Compute time of a tick over the last second, s."""
     tick_p99: float
@@ -166,12 +203,23 @@ class VelocityMessage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """From a person's sticks: after a silence nothing moves until they were centred."""
 
 
+class ArmingCheck(msgspec.Struct, frozen=True):
+    """One line of the arming list."""
+
+    name: str
+    ok: bool
+    words: str
+    """How it is, or why not."""
+
+
 class ModeReply(msgspec.Struct, frozen=True):
     """JSON reply to a query on ``command/mode``."""
 
     accepted: bool
     mode: str
     reason: str
+    checks: tuple[ArmingCheck, ...] = ()
+    """The arming list, in the reply to ``arm``."""
 
 
 class PolicyReply(msgspec.Struct, frozen=True):
@@ -414,6 +462,7 @@ class Keys:
         self.change_tuning = f"{root}/command/tuning"
         self.pose = f"{root}/command/pose"
         self.recording = f"{root}/recording"
+        self.faults = f"{root}/faults"
         self.alive = f"{root}/alive"
         self.operator = f"{root}/operator"
         self.sim_truth = f"{root}/sim/truth"

@@ -1,7 +1,8 @@
 """What the robot may do next: a pure transition table, every change and every refusal with its reason.
 
 DAMP → STAND_UP → STAND ⇄ WALK, STAND → SIT_DOWN → DAMP, and DAMP from anywhere. Only an armed robot leaves DAMP, and
-every way into DAMP disarms. A fault stays until ``clear``.
+every way into DAMP disarms. A fault sits the robot down where its legs still answer, damps it otherwise, and stays
+until ``clear``.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ class Reason(IntEnum):
     STOOD_UP = 5
     SAT_DOWN = 6
     COMMAND_LOST = 7
+    OPERATOR_LOST = 8
     STOPPING = 9
+    LATE_LOOP = 10
 
     NOT_ARMED = 20
     NOT_STANDING = 21
@@ -49,6 +52,17 @@ class Reason(IntEnum):
     SOLVER_FAILED = 51
     UNREACHABLE = 52
     BODY_SILENT = 53
+    FROZEN_IMU = 54
+    ATTITUDE_JUMP = 55
+    TURN_ERROR = 56
+    GRAVITY_ERROR = 57
+    JUMPING_ENCODER = 58
+    NOISY_ENCODER = 59
+    TORQUE_LOST = 60
+    REVERSED_MOTOR = 61
+    STALLED = 62
+    BAD_POLICY = 63
+    ASTRAY = 64
 
     @property
     def words(self) -> str:
@@ -57,7 +71,7 @@ class Reason(IntEnum):
 
     @property
     def is_fault(self) -> bool:
-        """Whether it takes the robot to damp and stays until cleared."""
+        """Whether it ends what the robot does and stays until cleared."""
         return self >= Reason.NOT_FINITE
 
 
@@ -70,7 +84,9 @@ WORDS: dict[Reason, str] = {
     Reason.STOOD_UP: "stood up",
     Reason.SAT_DOWN: "sat down",
     Reason.COMMAND_LOST: "no velocity command any more",
+    Reason.OPERATOR_LOST: "the operator is gone",
     Reason.STOPPING: "the daemon is stopping",
+    Reason.LATE_LOOP: "the loop came too late to walk on",
     Reason.NOT_ARMED: "not armed: ask for arm first",
     Reason.NOT_STANDING: "not standing: ask for stand first",
     Reason.NOT_DAMPED: "only in damp",
@@ -93,7 +109,57 @@ WORDS: dict[Reason, str] = {
     Reason.SOLVER_FAILED: "no ground reaction forces found",
     Reason.UNREACHABLE: "a foot target of the posture is out of reach",
     Reason.BODY_SILENT: "the body does not answer",
+    Reason.FROZEN_IMU: "the IMU repeats itself while the legs move",
+    Reason.ATTITUDE_JUMP: "the IMU's attitude jumped",
+    Reason.TURN_ERROR: "the IMU's rate of turn does not fit its attitude",
+    Reason.GRAVITY_ERROR: "the IMU does not feel gravity",
+    Reason.JUMPING_ENCODER: "a joint's position jumped",
+    Reason.NOISY_ENCODER: "a joint's position does not fit its speed",
+    Reason.TORQUE_LOST: "a motor does not give its torque",
+    Reason.REVERSED_MOTOR: "a motor turns against its command",
+    Reason.STALLED: "the loop stood still",
+    Reason.BAD_POLICY: "the policy asks for what cannot be",
+    Reason.ASTRAY: "a joint does not follow its target",
 }
+
+
+class Reaction(IntEnum):
+    """What a verdict of the guard leads to; the greater takes precedence."""
+
+    NONE = 0
+    STAND = 1
+    """A walk ends in standing; no fault."""
+    SIT_DOWN = 2
+    """Down on the legs, then damp."""
+    DAMP = 3
+
+
+GENTLE = frozenset(
+    {
+        Reason.STALE_IMU,
+        Reason.IMPLAUSIBLE_IMU,
+        Reason.FROZEN_IMU,
+        Reason.ATTITUDE_JUMP,
+        Reason.TURN_ERROR,
+        Reason.GRAVITY_ERROR,
+        Reason.HOT_MOTOR,
+        Reason.OVERLOAD,
+        Reason.LOW_VOLTAGE,
+        Reason.BAD_COMMAND,
+        Reason.BAD_POLICY,
+        Reason.SOLVER_FAILED,
+    }
+)
+"""Faults that leave every leg answering."""
+
+
+def reaction(reason: Reason, sit_down: bool) -> Reaction:
+    """What ``reason`` leads to; ``sit_down``: gently where the legs still answer."""
+    if reason is Reason.OK:
+        return Reaction.NONE
+    if reason is Reason.LATE_LOOP:
+        return Reaction.STAND
+    return Reaction.SIT_DOWN if sit_down and reason in GENTLE else Reaction.DAMP
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,17 +236,23 @@ def request(state: ModeState, wish: Request, verdict: Reason, ready: bool, settl
             assert_never(wish)
 
 
-def advance(state: ModeState, verdict: Reason, finished: bool, command_lost: bool) -> ModeState:
-    """The state after one tick: a fault damps, a finished posture moves on, a lost command stops the walk.
+def advance(
+    state: ModeState, verdict: Reason, finished: bool, command_lost: bool, answer: Reaction = Reaction.DAMP
+) -> ModeState:
+    """The state after one tick: a fault sits down or damps, a finished posture moves on, a lost command stops the walk.
 
     Args:
         state: before the tick.
-        verdict: of the guard, OK or a fault.
+        verdict: of the guard, OK or what is wrong.
         finished: the posture of STAND_UP or SIT_DOWN has reached its end.
         command_lost: no velocity command for longer than the configuration allows.
+        answer: what a verdict that is not OK leads to.
     """
     if verdict is not Reason.OK and (state.armed or state.mode is not Mode.DAMP):
-        return replace(_damped(state, verdict), fault=verdict)
+        given_up = _give_up(state, verdict, answer)
+        if given_up.mode is not state.mode or given_up.mode is Mode.DAMP:
+            return given_up
+        state = given_up
     if state.mode is Mode.STAND_UP and finished:
         return replace(state, mode=Mode.STAND, reason=Reason.STOOD_UP)
     if state.mode is Mode.SIT_DOWN and finished:
@@ -188,6 +260,21 @@ def advance(state: ModeState, verdict: Reason, finished: bool, command_lost: boo
     if state.mode is Mode.WALK and command_lost:
         return replace(state, mode=Mode.STAND, reason=Reason.COMMAND_LOST)
     return state
+
+
+def lose_operator(state: ModeState) -> ModeState:
+    """The state after a driver has gone: a walking robot stands."""
+    return replace(state, mode=Mode.STAND, reason=Reason.OPERATOR_LOST) if state.mode is Mode.WALK else state
+
+
+def _give_up(state: ModeState, verdict: Reason, answer: Reaction) -> ModeState:
+    if answer is Reaction.STAND:
+        return replace(state, mode=Mode.STAND, reason=verdict) if state.mode is Mode.WALK else state
+    if answer is not Reaction.SIT_DOWN or state.mode is Mode.DAMP:
+        return replace(_damped(state, verdict), fault=verdict)
+    if state.mode is Mode.SIT_DOWN:
+        return state if state.fault is not Reason.OK else replace(state, reason=verdict, fault=verdict)
+    return replace(state, mode=Mode.SIT_DOWN, reason=verdict, fault=verdict)
 
 
 def _damped(state: ModeState, reason: Reason) -> ModeState:
@@ -225,6 +312,8 @@ def _move(state: ModeState, entry: Entry, verdict: Reason) -> Answer:
         return Answer(state, entry is Reason.ALREADY, entry)
     if not state.armed:
         return _refused(state, Reason.NOT_ARMED)
+    if state.fault is not Reason.OK:
+        return _refused(state, Reason.FAULT_STANDS)
     if verdict is not Reason.OK:
         return _refused(state, verdict)
     return Answer(replace(state, mode=entry, reason=Reason.REQUESTED), True, Reason.REQUESTED)

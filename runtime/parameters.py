@@ -42,13 +42,83 @@ class LimitsConfig(Record, frozen=True, kw_only=True):
     """Time constant of the rms torque that is held against the continuous rating, s."""
     joint_margin: NonNegative = 0.1
     """How far outside its range a joint may be found at arming, rad."""
+    imu_extrapolation: Annotated[int, Meta(ge=0, le=10)] = 2
+    """Ticks for which a missing or unbelievable IMU sample is replaced by the last one, turned on by its own rate."""
+    frozen_time: Positive = 0.05
+    """An IMU whose bits stay the same for so long while joints move is not believed, s."""
+    max_attitude_jump: Angle = 0.3
+    """Turn between two samples beyond what the rates of turn explain, rad."""
+    max_turn_error: Positive = 0.4
+    """Between rate of turn and change of attitude, rad/s."""
+    turn_error_time: Positive = 0.2
+    """Time constant of that difference, s."""
+    max_gravity_error: Positive = 4.0
+    """Of the mean specific force from gravity's, m/s²."""
+    gravity_error_time: Positive = 1.0
+    """Time constant of that mean, s."""
+    max_position_jump: Positive = 0.3
+    """Way of a joint between two ticks beyond what its speed explains, rad."""
+    max_position_noise: Positive = 0.01
+    """The same, on the mean over 0.1 s, rad."""
+    max_tracking_error: Positive = 0.8
+    """Between a joint and its target, rad."""
+    tracking_time: Positive = 0.15
+    """For so long, s."""
+    min_torque_share: Annotated[float, Meta(gt=0, lt=1)] = 0.25
+    """A motor that gives less of its commanded torque, on the mean, has lost it; one that gives so much of the
+    opposite turns the wrong way."""
+    torque_share_time: Positive = 0.1
+    """Time constant of that mean, s."""
+    policy_bound: Annotated[float, Meta(ge=1)] = 10.0
+    """A policy that asks for more than so many times its own bounds is broken."""
+    stall_stand: Positive = 0.05
+    """A tick that comes later than this after the one before stops the walk, s."""
+    stall_damp: Positive = 0.1
+    """One that comes later than this damps: the motors' own watchdogs have let go, s."""
+    sit_down: bool = True
+    """Faults that leave the legs answering end in a controlled sit-down; false: in damp like all others."""
+
+
+class ArmingConfig(Record, frozen=True, kw_only=True):
+    """What must hold, beside the guard's verdict, before any motor gets torque."""
+
+    pose_tolerance: Angle = 1.2
+    """Largest distance of any joint from the nearer one of the folded and the standing pose, rad."""
+    gravity_tolerance: Positive = 2.0
+    """Of the specific force that a robot at rest feels, m/s²."""
+    contact_share: Positive = 1.5
+    """Largest foot force that limp legs may feign, as a share of the weight."""
+    soak_time: NonNegative = 0.5
+    """The loop must have run for so long, s; also what its punctuality is judged on."""
+    max_missed: Annotated[float, Meta(ge=0, le=1)] = 0.2
+    """Share of missed ticks lately."""
+    max_lateness: Positive = 0.05
+    """Latest tick lately, s."""
+    require_driver: bool = False
+    """A driver's liveliness token (``trotd joystick`` holds one) must be there; otherwise asking is enough."""
+
+
+class DegradeConfig(Record, frozen=True, kw_only=True):
+    """What is taken back before anything is given up."""
+
+    thermal_start: Celsius = 70.0
+    """From this motor temperature on its torque bound falls, °C."""
+    thermal_floor: Annotated[float, Meta(gt=0, le=1)] = 0.6
+    """Share of the peak torque that is left at ``limits.max_temperature``; 1: no derating."""
+    current_start: Annotated[float, Meta(gt=0, le=1)] = 0.85
+    """From this share of the continuous rating on, rms, a motor's torque bound falls towards 0.9 of that rating;
+    1: no derating."""
+    speed_floor: Annotated[float, Meta(gt=0, le=1)] = 0.5
+    """Share of the commanded speed that is left at ``limits.max_temperature`` or ``limits.min_voltage``."""
+    voltage_start: NonNegative = 0.0
+    """From this supply on down the speed falls, V; 0: never."""
 
 
 class PostureConfig(Record, frozen=True, kw_only=True):
     """Standing up and sitting down."""
 
-    soft_start: Positive = 0.8
-    """The gains grow from none to whole over this time, at the pose that was measured, s."""
+    soft_start: Positive = 1.0
+    """Gains and torque bound grow from none to whole over this time, from the pose that was measured, s."""
     fold_time: Positive = 1.0
     """Feet to under the hips, s."""
     rise_time: Positive = 1.5
@@ -77,6 +147,10 @@ class DampConfig(Record, frozen=True, kw_only=True):
     """Damping of every joint, N·m·s/rad."""
     deadline: Positive = 1.0
     """How long a stopping daemon goes on asking a silent body to damp, s."""
+    fall_kd: Positive = 8.0
+    """Damping for ``fall_time`` after a fault took a robot on its feet to damp, N·m·s/rad: it sinks, not drops."""
+    fall_time: NonNegative = 1.5
+    """s."""
 
 
 class LinkConfig(Record, frozen=True, kw_only=True):

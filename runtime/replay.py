@@ -144,6 +144,8 @@ class Player:
 
     def _operate(self, before: np.void, tick: np.void) -> None:
         """What came through the doors between two ticks."""
+        if tick["reason"] == Reason.OPERATOR_LOST and before["reason"] != Reason.OPERATOR_LOST:
+            self.cycle.lose_operator(self._measurement)
         for wish in self._wishes(before, tick):
             self.cycle.request(wish, self._measurement)
         generation = int(tick["policy"])

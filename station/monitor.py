@@ -31,6 +31,15 @@ CLAMP_WORDS = {
     Clamp.COMMAND: "velocity command beyond the bounds",
     Clamp.EXPIRED: "velocity command too old",
     Clamp.OBSERVATION: "velocity error beyond the observation's bound",
+    Clamp.THERMAL: "torque bound of a warm motor",
+    Clamp.CURRENT: "torque bound near the continuous rating",
+    Clamp.SOFT_START: "torque bound of the soft start",
+    Clamp.FALLBACK: "no solver's forces: least squares",
+    Clamp.SPEED: "speed bound from heat or supply",
+    Clamp.DEADMAN: "operator gone: standing",
+    Clamp.BLEND: "hand-over between two commands",
+    Clamp.COASTED: "a motor's reading older than a tick",
+    Clamp.EXTRAPOLATED: "IMU sample carried on by its rate",
 }
 """Every bit of ``clamps`` as people would say it."""
 

@@ -25,6 +25,8 @@ SEND_PERIOD = 0.05
 """Between two velocity commands, s: a quarter of what makes one expire."""
 SETTLE = 1.0
 """From the start of a leg of the tour to the first sample that counts, s."""
+ARM_TIMEOUT = 20.0
+"""For the loop to become punctual, s."""
 MODE_TIMEOUT = 15.0
 """For standing up and sitting down, s."""
 Velocity = tuple[float, float, float]
@@ -132,7 +134,7 @@ class Tour:
         problems: list[str] = []
         try:
             self._rest("damp", 1.0)
-            self._ask(Request.ARM)
+            self._arm()
             self._ask(Request.STAND)
             self._await("standing up", Mode.STAND)
             self._rest("stand", 1.0)
@@ -165,6 +167,17 @@ class Tour:
         except StationError as error:
             return [str(error)]
         return []
+
+    def _arm(self) -> None:
+        """Ask until the computer was punctual for long enough; any other obstacle is final."""
+        end = time.monotonic() + ARM_TIMEOUT
+        while True:
+            reply = self._station.ask_for(ModeReply, self._station.keys.mode, Request.ARM.value.encode())
+            if reply.accepted:
+                return
+            if {check.name for check in reply.checks if not check.ok} != {"timing"} or time.monotonic() > end:
+                raise TourError(f"arm refused: {reply.reason}")
+            self._rest("damp, until the loop is punctual", 0.5)
 
     def _ask(self, wish: Request) -> None:
         reply = self._station.ask_for(ModeReply, self._station.keys.mode, wish.value.encode())

@@ -35,6 +35,13 @@ QUICK = {
     "posture.settle_time": 0.01,
     "posture.blend_time": 0.02,
     "damp.deadline": 0.3,
+    "arming.soak_time": 0.0,  # the machine may be busy: no test is held to a time
+    "arming.max_missed": 1.0,
+    "arming.max_lateness": 60.0,
+    "limits.stall_stand": 60.0,
+    "limits.stall_damp": 60.0,
+    "limits.max_position_jump": 3.0,  # the null body is at once where it was told to be, without any speed
+    "limits.max_position_noise": 3.0,
     "recorder.seconds": 2.0,
     "audition.shadow": 0.1,
     "audition.blend": 0.05,

@@ -398,9 +398,12 @@ class PlainController:
         status = SolverStatus.IDLE
         if direct is not None:
             for leg in np.flatnonzero(self.stance):
-                x, y, z = direct[leg] + [0, 0, mass * GRAVITY / count]
+                wish = direct[leg] + [0, 0, mass * GRAVITY / count]
+                x, y, z = wish
                 z = np.clip(z, grf.min_force, grf.max_force)
                 forces[leg] = [*np.clip([x, y], -grf.friction * z, grf.friction * z), z]
+                if (forces[leg] != wish).any():
+                    self.clamps |= Clamp.FRICTION
         elif count:
             arms = r["feet"][self.stance] - self.rotation @ self.com
             wrench_map = np.vstack([np.tile(np.eye(3), count), np.hstack([skew(arm) for arm in arms])])
@@ -413,7 +416,9 @@ class PlainController:
             forces[self.stance] = solved.reshape(-1, 3)
             edge = grf.friction * forces[self.stance, 2] - 1e-6
             at_side = np.abs(forces[self.stance, :2]).max(axis=1) >= edge
-            if (at_side | (forces[self.stance, 2] >= grf.max_force - 1e-6)).any():
+            vertical = forces[self.stance, 2]
+            at_bound = (vertical >= grf.max_force - 1e-6) | (vertical <= grf.min_force + 1e-6)
+            if (at_side | at_bound).any():
                 self.clamps |= Clamp.FRICTION
         r["grf"] = forces
         return forces, status

@@ -108,7 +108,7 @@ def test_who_may_not_drive_gets_silence_and_moves_nothing(
     _, served = serve(bearers, tmp_path, monkeypatch, role.value, attempt)
     events = [event.text for event in served.daemon.link.history]
     assert not any("WALK" in text or "refused" in text for text in events)
-    assert not served.daemon.cycle._velocity.linear.any()
+    assert not served.daemon.cycle.sources.velocity.linear.any()
 
 
 @pytest.mark.parametrize("role", [Role.VIEWER, Role.OPERATOR])

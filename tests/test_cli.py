@@ -8,8 +8,11 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 from daemons import free_endpoint
+
+from runtime.messages import ModeReply
 
 ROBOT = Path(__file__).parents[1] / "runtime" / "robots" / "stoch3.toml"
 
@@ -100,7 +103,14 @@ def test_a_daemon_serves_the_verbs_and_ends_cleanly(tmp_path: Path) -> None:
                 time.sleep(0.2)
             assert answer.returncode == 1
             assert answer.stdout == "refused in DAMP: not armed: ask for arm first\n"
-            assert trotd("arm", *talk).stdout == "DAMP: armed\n"
+            while (armed := trotd("arm", *talk)).returncode:
+                assert "timing" in armed.stdout and time.monotonic() < end, armed.stdout
+                time.sleep(0.5)
+            *lines, last = armed.stdout.splitlines()
+            assert last == "DAMP: armed" and all(line.startswith("ok ") for line in lines)
+            assert {"motors", "imu", "calibration", "operator", "timing"} <= {line.split()[1] for line in lines}
+            again = msgspec.json.decode(trotd("arm", "--json", *talk).stdout.encode(), type=ModeReply)
+            assert [check.name for check in again.checks] == [line.split()[1] for line in lines]
             assert '"armed": true' in trotd("status", *talk).stdout
             second = trotd(*run, "--listen", free_endpoint())
             assert second.returncode == 2

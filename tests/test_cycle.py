@@ -20,12 +20,13 @@ from runtime.modes import Reason
 class Bench:
     """A cycle on the null body, tick by tick."""
 
-    def __init__(self) -> None:
-        self.config = make_config()
-        self.cycle = Cycle(self.config, make_policy())
+    def __init__(self, **changes: object) -> None:
+        self.config = make_config(**changes)
+        self.cycle = Cycle(self.config, make_policy(self.config.robot.name))
         self.body = Probe(self.config)
         self.command = damp_command(1.0)
         self.index = 0
+        self.lateness, self.overruns, self.elapsed = 0.0, 0, 0.005
         asyncio.run(self.body.connect())
         self.measurement = asyncio.run(self.body.exchange(self.command))
         self.cycle.warm_up(self.measurement)
@@ -42,7 +43,8 @@ class Bench:
                 exchange.send(None)
             except StopIteration as done:
                 self.measurement = done.value
-            self.command = self.cycle.step(wake(self.index), self.measurement)
+            due = replace(wake(self.index), lateness=self.lateness, overruns=self.overruns, elapsed=self.elapsed)
+            self.command = self.cycle.step(due, self.measurement)
         return self.command
 
     def ask(self, wish: Request) -> tuple[bool, str]:
@@ -172,10 +174,27 @@ def test_a_silent_body_damps(bench: Bench) -> None:
     assert any("no reply" in event.text for event in bench.cycle.events)
 
 
-def test_a_controller_that_finds_nothing_damps(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench.walk()
+def break_controller(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     nan = np.full((4, 3), math.nan)
     monkeypatch.setattr(bench.cycle.controller, "step", lambda *_: JointCommand(nan, nan, nan, nan, nan))
+
+
+def test_a_controller_that_finds_nothing_sits_down(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.walk()
+    break_controller(bench, monkeypatch)
+    command = bench.tick()
+    assert bench.cycle.state.mode is Mode.SIT_DOWN and bench.cycle.state.fault is Reason.BAD_COMMAND
+    assert all(np.isfinite(getattr(command, name)).all() for name in ("position", "velocity", "kp", "kd", "torque"))
+    assert bench.ask(Request.STAND) == (False, Reason.FAULT_STANDS.words)
+    bench.reach(Mode.DAMP)
+    assert is_damp(bench.command) and not bench.cycle.state.armed
+    assert bench.cycle.state.fault is Reason.BAD_COMMAND, "it stays until it is cleared"
+
+
+def test_a_controller_that_finds_nothing_damps_where_sitting_down_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(limits__sit_down=False)
+    bench.walk()
+    break_controller(bench, monkeypatch)
     assert is_damp(bench.tick())
     assert bench.cycle.state.fault is Reason.BAD_COMMAND
 

@@ -416,7 +416,7 @@ def test_a_driver_that_leaves_makes_a_walking_robot_stand(tmp_path: Path) -> Non
             loop = asyncio.get_running_loop()
             await served.client(hold_token)
             await served.reach(Mode.STAND)
-            assert any(event.text == "the operator is gone" for event in served.daemon.link.history)
+            assert any(event.text == "WALK -> STAND: the operator is gone" for event in served.daemon.link.history)
 
     asyncio.run(play())
 

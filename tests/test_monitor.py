@@ -39,7 +39,7 @@ def status(**changes: Any) -> Status:
         values
         | triples
         | {"armed": True, "policy": "", "rate_hz": 200.0, "clamps": {}, "solver": {}}
-        | {"recordings_refused": {}, "refused": {}}
+        | {"recordings_refused": {}, "refused": {}, "evidence": None}
         | changes,
         Status,
     )

@@ -136,6 +136,7 @@ def test_what_a_daemon_recorded_replays(tmp_path: Path) -> None:
     quick = (ROBOTS / "stoch3.toml").read_text().replace('name = "stoch3"', f'name = "{recording.header.robot}"')
     quick += (
         "\n[posture]\nsoft_start = 0.05\nfold_time = 0.05\nrise_time = 0.05\nsettle_time = 0.01\nblend_time = 0.02\n"
+        "\n[arming]\nsoak_time = 0.0\nmax_missed = 1.0\nmax_lateness = 60.0\n"
     )
     result = replay(changed(recording, robot_toml=quick))
     assert result.difference is None and result.ticks > 100 and "WALK" in result.modes

@@ -88,7 +88,6 @@ def imu_gone(walk: TwinWalk) -> None:
         (overheat, Reason.MOTOR_FAULT, 3, "FR hip"),
         (encoder_fault, Reason.MOTOR_FAULT, 1, "FL hip"),
         (brown_out, Reason.MOTOR_FAULT, 2, "BL"),
-        (imu_gone, Reason.STALE_IMU, 8, ""),
     ],
 )
 def test_every_fault_ends_in_damp_in_time_and_is_named(
@@ -101,6 +100,20 @@ def test_every_fault_ends_in_damp_in_time_and_is_named(
     assert named in " ".join(event.text for event in standing.cycle.events)
     assert not standing.command.kp.any()
     assert not standing.command.torque.any()
+
+
+def test_a_standing_robot_whose_imu_is_gone_sits_down(standing: TwinWalk):
+    imu_gone(standing)
+    for _ in range(8):
+        standing.tick()
+    state = standing.cycle.state
+    assert state.mode is Mode.SIT_DOWN and state.fault is Reason.STALE_IMU
+    for _ in range(1200):
+        standing.tick()
+        if standing.cycle.state.mode is Mode.DAMP:
+            break
+    assert standing.cycle.state.mode is Mode.DAMP and standing.cycle.state.reason is Reason.SAT_DOWN
+    assert standing.cycle.state.fault is Reason.STALE_IMU
 
 
 def test_two_missed_ticks_are_coasted_and_scattered_losses_do_not_matter(standing: TwinWalk):

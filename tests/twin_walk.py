@@ -79,7 +79,7 @@ class TwinWalk:
         self.now = 100.0
         self.world = World(self.config.robot, RATE_HZ, control.gait.walking_height)
         self.cycle = Cycle(self.config, load(find_policy(control.policy), self.config.robot.name))
-        scenario = scenario or Scenario(noise=REAL_NOISE, joint_position=self.cycle.posture.folded_joints)
+        scenario = scenario or Scenario(noise=REAL_NOISE, joint_position=self.cycle.sources.posture.folded_joints)
         self.twin = TwinBody(self.world, TwinSetup(lab_build(), self.config.motors, scenario), self.clock)
         self.imu = LockstepImu((1.0, 0.0, 0.0, 0.0))
         self.motors = Motors(self.config.motors, InProcessBus(self.twin.wire.answer), 0.003, clock=self.clock)
@@ -140,7 +140,7 @@ class TwinWalk:
             assert answer.accepted, words
 
     def stand(self) -> None:
-        self.run(0.2)
+        self.run(0.6)
         self.ask(Request.ARM, Request.STAND)
         for _ in range(60):
             self.run(0.1)

@@ -15,12 +15,16 @@ import numpy as np
 from drivers.robot import Array, Robot
 from runtime.config import Config
 from runtime.doors import Channel
-from runtime.messages import Keys, SimTruth, decode_hold, decode_push
+from runtime.messages import ArmingCheck, Keys, SimTruth, decode_hold, decode_push
 
 if TYPE_CHECKING:
     from sim.world import World
 
 KINDS = ("sim", "hardware", "twin", "null")
+TWIN_MAX_AGE = 0.25
+"""The guard's bound on ages for a twin, s: what kernel workers of a busy computer keep a terminal's bytes."""
+STALL_STAND, STALL_DAMP = 0.25, 1.0
+"""The guard's bounds on a late loop for bodies that wait for it, s."""
 
 
 class BodyError(ValueError):
@@ -33,6 +37,24 @@ class Body:
 
     robot: Robot
     channels: Callable[[Keys], Sequence[Channel]]
+    checks: Callable[[], Sequence[ArmingCheck]] = lambda: (ArmingCheck("calibration", True, "exact by construction"),)
+    """What it adds to the arming list."""
+
+
+def lenient(kind: str, config: Config) -> Config:
+    """``config`` with those bounds of the guard that a busy computer would pass instead of a robot."""
+    if kind == "hardware":
+        return config
+    limits = config.limits
+    limits = msgspec.structs.replace(
+        limits,
+        max_age=max(limits.max_age, TWIN_MAX_AGE if kind == "twin" else 0.0),
+        stall_stand=max(limits.stall_stand, STALL_STAND),
+        stall_damp=max(limits.stall_damp, STALL_DAMP),
+    )
+    if kind == "null":  # it is at once where it was told to be, without any speed
+        limits = msgspec.structs.replace(limits, max_position_jump=3.0, max_position_noise=3.0)
+    return msgspec.structs.replace(config, limits=limits)
 
 
 def build_body(kind: str, config: Config, robot_file: Path, folder: Path, observe: bool = False) -> Body:
@@ -51,9 +73,10 @@ def build_body(kind: str, config: Config, robot_file: Path, folder: Path, observ
         ValueError: the robot's poses cannot be.
     """
     if kind in ("hardware", "twin"):
-        from trotd.wire import wired_body
+        from trotd.wire import check_calibration, wired_body
 
-        return Body(wired_body(kind, config, folder, observe), lambda _keys: ())
+        robot = wired_body(kind, config, folder, observe)
+        return Body(robot, lambda _keys: (), lambda: (check_calibration(kind, config, folder),))
     if observe:
         raise BodyError(f"body {kind!r} has no motors that could be left alone: --observe is for hardware and twin")
     if kind == "null":

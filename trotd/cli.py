@@ -19,6 +19,7 @@ from trotd import cli_bench, cli_hardware, cli_live, cli_ros2, cli_station, cli_
 
 if TYPE_CHECKING:
     from runtime.config import Config
+    from runtime.messages import ModeReply
 
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")  # before numpy loads: small matrices are 80 times slower on two threads
@@ -110,15 +111,16 @@ def run(
     with _one_line_errors():
         from runtime import daemon, policies
         from runtime.state import memory_folder, state_folder
-        from trotd.bodies import build_body
+        from trotd.bodies import build_body, lenient
 
         config, path = _load(robot, rate_hz, listen)
         chosen = policies.load(policies.find_policy(policy or config.control.policy, path.parent), config.robot.name)
         place = folder or state_folder()
+        config = lenient(body, config)
         if body in ("hardware", "twin"):
-            from trotd.wire import lenient, with_baseline
+            from trotd.wire import with_baseline
 
-            config = with_baseline(body, lenient(config) if body == "twin" else config, place)
+            config = with_baseline(body, config, place)
         part = build_body(body, config, path, place, observe)
         job = daemon.Job(
             config,
@@ -130,6 +132,7 @@ def run(
             _say_ready,
             simulated=body != "hardware",
             memory=memory_folder(place),
+            checks=part.checks,
         )
         for written in daemon.main(job).flight.written:
             typer.echo(f"recording: {written}")
@@ -178,23 +181,81 @@ def status(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPO
             typer.echo(msgspec.json.format(msgspec.json.encode(station.next_status())))
 
 
+def _ask(word: str, robot: str, connect: str) -> ModeReply:
+    from runtime.messages import ModeReply
+    from station.session import connected
+
+    config, _ = _load(robot, None, None)
+    with connected(config.robot.name, connect) as station:
+        return station.ask_for(ModeReply, station.keys.mode, word.encode())
+
+
+def _say_reply(reply: ModeReply) -> None:
+    typer.echo(f"{reply.mode}: {reply.reason}" if reply.accepted else f"refused in {reply.mode}: {reply.reason}")
+
+
 def _request(word: str, robot: str, connect: str) -> None:
     with _one_line_errors():
-        from runtime.messages import ModeReply
-        from station.session import connected
-
-        config, _ = _load(robot, None, None)
-        with connected(config.robot.name, connect) as station:
-            reply = station.ask_for(ModeReply, station.keys.mode, word.encode())
-        typer.echo(f"{reply.mode}: {reply.reason}" if reply.accepted else f"refused in {reply.mode}: {reply.reason}")
+        reply = _ask(word, robot, connect)
+        _say_reply(reply)
         if not reply.accepted:
             raise typer.Exit(FAILED)
 
 
 @app.command()
-def arm(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
-    """Let the robot leave DAMP, if nothing speaks against it; says what does."""
-    _request("arm", robot, connect)
+def arm(
+    robot: RobotOption = "stoch3",
+    connect: ConnectOption = DEFAULT_ENDPOINT,
+    json: Annotated[bool, typer.Option("--json", help="The reply with the whole list as JSON.")] = False,
+) -> None:
+    """Let the robot leave DAMP, if nothing speaks against it: the arming list, each line ok or why not.
+
+    No motor gets torque before every line is ok, and then only through a soft start. Exit code 1 if it was refused.
+    """
+    with _one_line_errors():
+        import msgspec
+
+        reply = _ask("arm", robot, connect)
+        if json:
+            typer.echo(msgspec.json.encode(reply).decode())
+        else:
+            for check in reply.checks:
+                typer.echo(f"{'ok  ' if check.ok else 'NO  '} {check.name:12} {check.words}")
+            _say_reply(reply)
+        if not reply.accepted:
+            raise typer.Exit(FAILED)
+
+
+@app.command()
+def faults(
+    robot: RobotOption = "stoch3",
+    connect: ConnectOption = DEFAULT_ENDPOINT,
+    json: Annotated[bool, typer.Option("--json", help="The history as JSON.")] = False,
+    folder: Annotated[
+        Path | None, typer.Option("--state", help="Read it from this state folder instead of asking the daemon.")
+    ] = None,
+) -> None:
+    """The history of faults, oldest first: when, what, where, how much, against which bound, and what it led to."""
+    with _one_line_errors():
+        import msgspec
+
+        from runtime.faults import fault_file, load_faults
+        from runtime.messages import FaultRecord
+        from station.session import connected
+
+        config, _ = _load(robot, None, None)
+        if folder is not None:
+            history = load_faults(fault_file(folder, config.robot.name))
+        else:
+            with connected(config.robot.name, connect) as station:
+                history = station.ask_for(list[FaultRecord], station.keys.faults)
+        if json:
+            typer.echo(msgspec.json.encode(history).decode())
+            return
+        for fault in history:
+            typer.echo(f"{fault.time}  tick {fault.tick:>9}  {fault.mode} -> {fault.led_to}: {fault.evidence.words}")
+        if not history:
+            typer.echo("no fault in memory")
 
 
 @app.command()

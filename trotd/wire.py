@@ -18,11 +18,10 @@ from drivers.errors import DriverError
 from drivers.hardware import HardwareRobot
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
 from runtime.config import Config
+from runtime.messages import ArmingCheck
 
 TWIN_REPLY_TIME = 0.1
 """How long a twin's replies are waited for, s: its process shares the computer with everybody, and its time with us."""
-TWIN_MAX_AGE = 0.25
-"""The guard's bound on ages for a twin, s: what kernel workers of a busy computer keep a terminal's bytes."""
 MEETING, IMU_LINK, KNOWN = "wire.json", "imu", "calibration.json"
 _GROUPS = "239.74.163.{}"
 
@@ -109,10 +108,15 @@ def with_baseline(kind: str, config: Config, folder: Path) -> Config:
     return msgspec.structs.replace(config, control=msgspec.structs.replace(config.control, contact=contact))
 
 
-def lenient(config: Config) -> Config:
-    """``config`` with the one bound of the guard that a busy computer would pass instead of a robot."""
-    limits = msgspec.structs.replace(config.limits, max_age=max(config.limits.max_age, TWIN_MAX_AGE))
-    return msgspec.structs.replace(config, limits=limits)
+def check_calibration(kind: str, config: Config, folder: Path) -> ArmingCheck:
+    """A line of the arming list: whether the calibration on the disk is valid for this robot now."""
+    try:
+        wires = wires_of(kind, config, folder)
+        path = calibration_file(kind, config, folder)
+        found = calibration.load(path, config.robot, wires.motors)
+    except DriverError as error:
+        return ArmingCheck("calibration", False, str(error))
+    return ArmingCheck("calibration", True, f"of {found.date:%Y-%m-%d %H:%M}")
 
 
 def favour(process: int) -> None:

@@ -22,13 +22,21 @@ _ROOT = Path(__file__).parents[2]
 
 def source_digest(package: str) -> str:
     """Digest of every source file that compiled code of ``package`` may call: its own room's and those below."""
-    below = {"sim": ("sim",), "training": ("sim", "training")}.get(package, ())
+    below = {"guard": ("runtime",), "sim": ("sim",), "training": ("sim", "training")}.get(package, ())
     digest = hashlib.sha256()
     for room in ("drivers", "runtime/control", *below):
         for path in sorted((_ROOT / room).glob("*.py")):
-            digest.update(path.name.encode())
-            digest.update(path.read_bytes())
+            text = path.read_bytes()
+            if room != "runtime" or b"@compiled" in text:
+                digest.update(path.name.encode())
+                digest.update(text)
     return digest.hexdigest()[:16]
+
+
+def package_of(module: str) -> str:
+    """The package that a module's compiled code belongs to: the runtime outside its core is ``guard``."""
+    package = module.partition(".")[0]
+    return "guard" if package == "runtime" and not module.startswith("runtime.control.") else package
 
 
 @lru_cache
@@ -48,5 +56,5 @@ def cache_folder(package: str) -> Path:
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call, or load it from the cache. Divisions by zero give inf, as in numpy."""
-    numba.config.CACHE_DIR = str(cache_folder(function.__module__.partition(".")[0]))  # type: ignore[attr-defined]
+    numba.config.CACHE_DIR = str(cache_folder(package_of(function.__module__)))  # type: ignore[attr-defined]
     return cast(Callable[..., Any], numba.njit(cache=True, error_model="numpy")(function))

@@ -176,7 +176,8 @@ def share_forces(p, t, force):  # type: ignore[no-untyped-def]
             t.grf[leg] = force[3 * index : 3 * index + 3]
             fz = t.grf[leg, 2]
             edge = p.friction * fz - 1e-6
-            if abs(t.grf[leg, 0]) >= edge or abs(t.grf[leg, 1]) >= edge or fz >= p.max_force - 1e-6:
+            bounded = fz >= p.max_force - 1e-6 or fz <= p.min_force + 1e-6
+            if bounded or abs(t.grf[leg, 0]) >= edge or abs(t.grf[leg, 1]) >= edge:
                 t.clamps |= _FRICTION
             index += 1
 
@@ -192,5 +193,9 @@ def cut_forces(p, t):  # type: ignore[no-untyped-def]
         wanted = t.grf[leg, 2] + p.mass * GRAVITY / legs
         t.grf[leg, 2] = min(p.max_force, max(p.min_force, wanted))
         side = p.friction * t.grf[leg, 2]
+        cut = t.grf[leg, 2] != wanted
         for i in range(2):
+            cut = cut or abs(t.grf[leg, i]) > side
             t.grf[leg, i] = min(side, max(-side, t.grf[leg, i]))
+        if cut:
+            t.clamps |= _FRICTION

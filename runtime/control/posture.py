@@ -116,6 +116,8 @@ class Posture:
         self.folded = self._feet(footholds, hip - times.fold_height * description.reach)
         self.folded_joints, _ = inverse(self.geometry, self.folded)
         """Where standing up begins and sitting down ends, rad. Shape (4, 3)."""
+        self.standing_joints, _ = inverse(self.geometry, self.standing)
+        """Where standing up ends, rad. Shape (4, 3)."""
         for name, feet in (("control.gait.walking_height", self.standing), ("posture.fold_height", self.folded)):
             self._check(description, name, feet)
         self.reset()

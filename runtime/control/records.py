@@ -49,7 +49,7 @@ class SolverStatus(IntEnum):
 
 
 class Clamp(IntFlag):
-    """Why the motors get less than the policy asked: the bits of ``clamps``."""
+    """Why the motors get something else than was asked, or why a measurement was not taken as it came: ``clamps``."""
 
     SHIFT = 1
     """A foot shift beyond its bound."""
@@ -71,6 +71,24 @@ class Clamp(IntFlag):
     """The velocity command is too old: ramped to zero."""
     OBSERVATION = 512
     """A velocity error beyond the observation's bound."""
+    THERMAL = 1024
+    """A foreseen torque beyond what a motor so warm is given."""
+    CURRENT = 2048
+    """A foreseen torque beyond what a motor near its continuous rating is given."""
+    SOFT_START = 4096
+    """A foreseen torque beyond the bound that grows after the robot left DAMP."""
+    FALLBACK = 8192
+    """No solver's forces were accepted: clipped least squares instead."""
+    SPEED = 16384
+    """A velocity command beyond what heat and battery allow."""
+    DEADMAN = 32768
+    """The operator is gone: standing instead of what was asked last."""
+    BLEND = 65536
+    """Hand-over from one source of commands to the next."""
+    COASTED = 131072
+    """A motor's reading is older than a tick: its last one stands in."""
+    EXTRAPOLATED = 262144
+    """No new believable sample of the IMU: the last one carried on by its own rate of turn."""
 
 
 ESTIMATE_FIELDS: Fields = [
