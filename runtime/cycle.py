@@ -27,6 +27,8 @@ from runtime.sources import COMMAND_FIELDS, Sources
 
 __all__ = ["EVENTS", "KEYFRAME_DTYPE", "Cycle", "Fault", "Wake"]
 
+STILL = 0.15
+"""m/s: a robot that stands and is no faster may sit down."""
 EVENTS = 256
 """Events that wait for the link at most; the oldest go first."""
 
@@ -181,7 +183,8 @@ class Cycle:
         walk_lost = wake.stamp - sources.velocity.stamp > self.config.command.stand_after
         before = self.state
         answer = self.guard.reaction(verdict) if verdict is not _OK else Reaction.NONE
-        self.state = modes.advance(before, verdict, sources.posture.finished, walk_lost, answer)
+        settled = before.mode is not _STAND or self._settled()
+        self.state = modes.advance(before, verdict, sources.posture.finished, walk_lost, answer, settled)
         self._changed(before, measurement)
         command = sources.step(
             self.state.mode, wake.stamp, measurement, self.guard.imu_believed, self.guard.speed_share
@@ -261,6 +264,11 @@ class Cycle:
         """Add an event."""
         tick = self.tick[0]
         self.events.append(Event(stamp=float(tick["stamp"]), tick=int(tick["index"]), kind=kind, text=text))
+
+    def _settled(self) -> bool:
+        """Whether it stood on all four and still a tick ago."""
+        twist = self._views["twist"]
+        return bool(self._views["stance"].all()) and float(np.hypot(twist[0], twist[1])) < STILL
 
     def _begin(self, wake: Wake) -> None:
         row = self._row
@@ -345,7 +353,8 @@ class Cycle:
         """Give up for ``reason``; an armed robot keeps it as the fault that stands."""
         before = self.state
         answer = self.guard.reaction(reason)
-        self.state = modes.advance(before, reason, False, False, answer)
+        settled = before.mode is _STAND and self._settled()
+        self.state = modes.advance(before, reason, False, False, answer, settled)
         if self.state is not before:
             self._stand_fault(before, words)
             self._enter(before, measurement)

@@ -10,6 +10,7 @@ import math
 
 from runtime.control.compilation import compiled
 from runtime.control.records import Clamp
+from runtime.messages import Mode
 from runtime.modes import Reason
 from runtime.verdict import find
 
@@ -34,6 +35,7 @@ _JOINT_SPEED, _LOW_VOLTAGE, _OVERLOAD, _BAD_COMMAND, _BAD_POLICY = (
         Reason.BAD_POLICY,
     )
 )
+_WALK = int(Mode.WALK)
 _LATE_LOOP, _STALLED = int(Reason.LATE_LOOP), int(Reason.STALLED)
 _TORQUE, _COASTED = int(Clamp.TORQUE), int(Clamp.COASTED)
 
@@ -74,7 +76,7 @@ def judge_body(t, b, m):  # type: ignore[no-untyped-def]
         find(m, b, _LOW_VOLTAGE, -1, t.voltage, b.voltage)
     if t.period > b.stall_damp:
         find(m, b, _STALLED, -1, t.period, b.stall_damp)
-    elif t.period > b.stall_stand:
+    elif t.period > b.stall_stand and t.mode == _WALK:
         find(m, b, _LATE_LOOP, -1, t.period, b.stall_stand)
 
 

@@ -1,8 +1,8 @@
 """What the robot may do next: a pure transition table, every change and every refusal with its reason.
 
 DAMP → STAND_UP → STAND ⇄ WALK, STAND → SIT_DOWN → DAMP, and DAMP from anywhere. Only an armed robot leaves DAMP, and
-every way into DAMP disarms. A fault sits the robot down where its legs still answer, damps it otherwise, and stays
-until ``clear``.
+every way into DAMP disarms. A fault that leaves the legs answering sits a standing robot down; one that leaves the
+controller whole stops a walking one first. All others damp. Every fault stays until ``clear``.
 """
 
 from __future__ import annotations
@@ -129,12 +129,17 @@ class Reaction(IntEnum):
     NONE = 0
     STAND = 1
     """A walk ends in standing; no fault."""
-    SIT_DOWN = 2
-    """Down on the legs, then damp."""
-    DAMP = 3
+    STOP_AND_SIT = 2
+    """A walk ends in standing first; then down on the legs, then damp."""
+    SIT_DOWN = 3
+    """Down on the legs where it stands, then damp; from a walk damp at once: without attitude or policy nothing
+    keeps a walking robot up until it stands."""
+    DAMP = 4
 
 
-GENTLE = frozenset(
+STOPPED = frozenset({Reason.HOT_MOTOR, Reason.OVERLOAD, Reason.LOW_VOLTAGE})
+"""Faults that leave every leg answering and the controller whole."""
+SEATED = frozenset(
     {
         Reason.STALE_IMU,
         Reason.IMPLAUSIBLE_IMU,
@@ -142,9 +147,6 @@ GENTLE = frozenset(
         Reason.ATTITUDE_JUMP,
         Reason.TURN_ERROR,
         Reason.GRAVITY_ERROR,
-        Reason.HOT_MOTOR,
-        Reason.OVERLOAD,
-        Reason.LOW_VOLTAGE,
         Reason.BAD_COMMAND,
         Reason.BAD_POLICY,
         Reason.SOLVER_FAILED,
@@ -159,7 +161,9 @@ def reaction(reason: Reason, sit_down: bool) -> Reaction:
         return Reaction.NONE
     if reason is Reason.LATE_LOOP:
         return Reaction.STAND
-    return Reaction.SIT_DOWN if sit_down and reason in GENTLE else Reaction.DAMP
+    if sit_down and reason in STOPPED:
+        return Reaction.STOP_AND_SIT
+    return Reaction.SIT_DOWN if sit_down and reason in SEATED else Reaction.DAMP
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +241,12 @@ def request(state: ModeState, wish: Request, verdict: Reason, ready: bool, settl
 
 
 def advance(
-    state: ModeState, verdict: Reason, finished: bool, command_lost: bool, answer: Reaction = Reaction.DAMP
+    state: ModeState,
+    verdict: Reason,
+    finished: bool,
+    command_lost: bool,
+    answer: Reaction = Reaction.DAMP,
+    settled: bool = True,
 ) -> ModeState:
     """The state after one tick: a fault sits down or damps, a finished posture moves on, a lost command stops the walk.
 
@@ -247,12 +256,15 @@ def advance(
         finished: the posture of STAND_UP or SIT_DOWN has reached its end.
         command_lost: no velocity command for longer than the configuration allows.
         answer: what a verdict that is not OK leads to.
+        settled: a robot in STAND stands on all four and still.
     """
     if verdict is not Reason.OK and (state.armed or state.mode is not Mode.DAMP):
-        given_up = _give_up(state, verdict, answer)
+        given_up = _give_up(state, verdict, answer, settled)
         if given_up.mode is not state.mode or given_up.mode is Mode.DAMP:
             return given_up
         state = given_up
+    if state.mode is Mode.STAND and state.fault is not Reason.OK and settled:
+        return replace(state, mode=Mode.SIT_DOWN)
     if state.mode is Mode.STAND_UP and finished:
         return replace(state, mode=Mode.STAND, reason=Reason.STOOD_UP)
     if state.mode is Mode.SIT_DOWN and finished:
@@ -267,14 +279,16 @@ def lose_operator(state: ModeState) -> ModeState:
     return replace(state, mode=Mode.STAND, reason=Reason.OPERATOR_LOST) if state.mode is Mode.WALK else state
 
 
-def _give_up(state: ModeState, verdict: Reason, answer: Reaction) -> ModeState:
+def _give_up(state: ModeState, verdict: Reason, answer: Reaction, settled: bool) -> ModeState:
+    mode = state.mode
     if answer is Reaction.STAND:
-        return replace(state, mode=Mode.STAND, reason=verdict) if state.mode is Mode.WALK else state
-    if answer is not Reaction.SIT_DOWN or state.mode is Mode.DAMP:
+        return replace(state, mode=Mode.STAND, reason=verdict) if mode is Mode.WALK else state
+    unsteady = mode is Mode.WALK or (mode is Mode.STAND and not settled)
+    if answer is Reaction.DAMP or mode is Mode.DAMP or (unsteady and answer is Reaction.SIT_DOWN):
         return replace(_damped(state, verdict), fault=verdict)
-    if state.mode is Mode.SIT_DOWN:
-        return state if state.fault is not Reason.OK else replace(state, reason=verdict, fault=verdict)
-    return replace(state, mode=Mode.SIT_DOWN, reason=verdict, fault=verdict)
+    fault = verdict if state.fault is Reason.OK else state.fault
+    to = Mode.STAND if unsteady else Mode.SIT_DOWN
+    return state if state.fault is fault and mode is to else replace(state, mode=to, reason=verdict, fault=fault)
 
 
 def _damped(state: ModeState, reason: Reason) -> ModeState:

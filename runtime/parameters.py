@@ -148,7 +148,7 @@ class DampConfig(Record, frozen=True, kw_only=True):
     deadline: Positive = 1.0
     """How long a stopping daemon goes on asking a silent body to damp, s."""
     fall_kd: Positive = 8.0
-    """Damping for ``fall_time`` after a fault took a robot on its feet to damp, N·m·s/rad: it sinks, not drops."""
+    """Damping for ``fall_time`` after a fault took a robot that did not walk to damp, N·m·s/rad: it sinks."""
     fall_time: NonNegative = 1.5
     """s."""
 

@@ -67,7 +67,10 @@ class Sources:
         return self._blended(self.posture.step())
 
     def limp(self) -> JointCommand:
-        """Damping only; more of it for a while after a fault took a robot on its feet."""
+        """Damping only; more of it for a while after a fault took a robot that stood to damp.
+
+        A walking one is better off with less: stiff legs trip it, and it falls over them.
+        """
         if self.fall_left <= 0.0:
             return self.damp
         self.fall_left -= self._period
@@ -78,7 +81,7 @@ class Sources:
         self.hand_over()
         if _DAMP in (before, after):
             self.blend_left = 0.0
-        self.fall_left = self._fall_time if after is _DAMP and fault else 0.0
+        self.fall_left = self._fall_time if after is _DAMP and fault and before is not _WALK else 0.0
         if after is _DAMP or measurement is None:
             self.posture.reset()
         elif after is _STAND_UP:

@@ -169,7 +169,11 @@ def test_a_walk_that_is_killed_is_there_at_the_next_start(tmp_path: Path, number
     robot = _robot(tmp_path)
     with running(tmp_path, robot, "null") as (process, station):
         for wish, mode in ((Request.ARM, "DAMP"), (Request.STAND, "STAND"), (Request.WALK, "WALK")):
-            assert station.ask_for(ModeReply, station.keys.mode, wish.value.encode()).accepted
+            end = time.monotonic() + 60.0
+            while not (reply := station.ask_for(ModeReply, station.keys.mode, wish.value.encode())).accepted:
+                assert {check.name for check in reply.checks if not check.ok} == {"timing"}, reply.reason
+                assert time.monotonic() < end, reply.reason
+                time.sleep(0.2)
             while station.next_status().mode != mode:
                 pass
         for _ in range(20):

@@ -66,6 +66,12 @@ class Bench:
         assert self.ask(Request.WALK)[0]
         self.tick()
 
+    def stand(self) -> None:
+        self.tick()
+        assert self.ask(Request.ARM)[0] and self.ask(Request.STAND)[0]
+        self.reach(Mode.STAND)
+        self.tick(20)
+
     def velocity(self, x: float) -> None:
         self.cycle.command_velocity(VelocityCommand(self.now, np.array([x, 0.0]), 0.0))
 
@@ -179,8 +185,10 @@ def break_controller(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench.cycle.controller, "step", lambda *_: JointCommand(nan, nan, nan, nan, nan))
 
 
-def test_a_controller_that_finds_nothing_sits_down(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench.walk()
+def test_a_controller_that_finds_nothing_sits_a_standing_robot_down(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.stand()
     break_controller(bench, monkeypatch)
     command = bench.tick()
     assert bench.cycle.state.mode is Mode.SIT_DOWN and bench.cycle.state.fault is Reason.BAD_COMMAND
@@ -191,9 +199,27 @@ def test_a_controller_that_finds_nothing_sits_down(bench: Bench, monkeypatch: py
     assert bench.cycle.state.fault is Reason.BAD_COMMAND, "it stays until it is cleared"
 
 
+def test_a_controller_that_finds_nothing_damps_a_walking_robot(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.walk()
+    break_controller(bench, monkeypatch)
+    assert is_damp(bench.tick())
+    assert bench.cycle.state.fault is Reason.BAD_COMMAND
+
+
+def test_a_fault_that_leaves_the_controller_whole_stops_a_walking_robot_before_it_sits(bench: Bench) -> None:
+    bench.walk()
+    bench.body.change = lambda m: spoil(m, temperature=np.full((4, 3), 90.0))
+    bench.tick()
+    assert bench.cycle.state.mode is Mode.STAND and bench.cycle.state.fault is Reason.HOT_MOTOR
+    assert bench.ask(Request.WALK) == (False, Reason.FAULT_STANDS.words)
+    bench.reach(Mode.SIT_DOWN)
+    bench.reach(Mode.DAMP)
+    assert bench.cycle.state.fault is Reason.HOT_MOTOR
+
+
 def test_a_controller_that_finds_nothing_damps_where_sitting_down_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(limits__sit_down=False)
-    bench.walk()
+    bench.stand()
     break_controller(bench, monkeypatch)
     assert is_damp(bench.tick())
     assert bench.cycle.state.fault is Reason.BAD_COMMAND

@@ -20,7 +20,7 @@ from station.session import Station
 
 def fault(tick: int) -> Fault:
     evidence = Evidence(reason="hot_motor", words="hot", where="FL knee", value=81.0, bound=80.0, unit="°C")
-    return Fault(tick, Mode.WALK, Mode.SIT_DOWN, evidence)
+    return Fault(tick, Mode.WALK, Mode.STAND, evidence)
 
 
 def test_a_fault_names_what_where_value_bound_and_tick() -> None:
@@ -31,7 +31,7 @@ def test_a_fault_names_what_where_value_bound_and_tick() -> None:
     bench.body.change = lambda m: spoil(m, temperature=hot)
     bench.tick()
     (found,) = bench.cycle.faults
-    assert (found.tick, found.mode, found.led_to) == (bench.index, Mode.WALK, Mode.SIT_DOWN)
+    assert (found.tick, found.mode, found.led_to) == (bench.index, Mode.WALK, Mode.STAND)
     evidence = found.evidence
     assert (evidence.reason, evidence.where, evidence.unit) == ("hot_motor", "BL hip", "°C")
     assert (evidence.value, evidence.bound) == (95.0, 80.0)
@@ -65,7 +65,7 @@ def test_the_history_outlives_the_process_and_is_bounded(tmp_path: Path) -> None
     assert not list(path.parent.glob(".*")), "nothing half written is left"
     again = FaultHistory(path)
     assert [record.tick for record in again.records] == list(range(5, KEPT + 5))
-    assert again.records[-1].evidence == fault(0).evidence and again.records[-1].led_to == "SIT_DOWN"
+    assert again.records[-1].evidence == fault(0).evidence and again.records[-1].led_to == "STAND"
 
 
 @pytest.mark.parametrize(

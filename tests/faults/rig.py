@@ -150,7 +150,7 @@ class Rig:
             self.config = config.override(config.load(config.find_robot("stoch3")), "test", SETTINGS)
             policy = load(find_policy(self.config.control.policy), self.config.robot.name)
             self.cycle = Cycle(self.config, policy)
-            self.body = SimBody(self.config, self.cycle.posture.folded_joints, base)
+            self.body = SimBody(self.config, self.cycle.sources.posture.folded_joints, base)
         self.world = self.body.world
         self.period = 1.0 / self.config.control.rate_hz
         self.faults: list[Fault] = []
@@ -225,7 +225,7 @@ class Rig:
             assert seconds > 0, f"still {self.cycle.state}: {[event.text for event in self.cycle.events]}"
 
     def stand(self) -> None:
-        self.run(0.2)
+        self.run(0.6)
         self.ask(Request.ARM, Request.STAND)
         self.reach(Mode.STAND)
         self.run(0.5)
