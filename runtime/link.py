@@ -11,7 +11,7 @@ import re
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -51,6 +51,21 @@ def session_config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> 
     return config
 
 
+class Outlet:
+    """One outgoing key, and whether anybody listens: asked once and told from then on, because asking costs 20 µs."""
+
+    def __init__(self, session: zenoh.Session, key: str, congestion: zenoh.CongestionControl) -> None:
+        self._publisher: Any = session.declare_publisher(key, congestion_control=congestion)
+        self.heard: bool = True
+        """Somebody subscribes to it."""
+        self._listener = self._publisher.declare_matching_listener(self._match)
+        self.heard = bool(cast(Any, self._publisher.matching_status).matching)
+        self.put = self._publisher.put
+
+    def _match(self, status: Any) -> None:
+        self.heard = bool(status.matching)
+
+
 class Link:
     """One robot's keys on one session."""
 
@@ -70,7 +85,7 @@ class Link:
         self._doors, self._channels = doors, channels
         self._status_every = max(1, round(whole.control.rate_hz / config.status_hz / config.batch))
         self._batches = 0
-        self._rows = np.zeros((2, config.batch), TICK_DTYPE)
+        self._bytes = np.zeros((2, config.batch, TICK_DTYPE.itemsize), np.uint8)
         self._filling, self._filled = 0, 0
         self._full: int | None = None
         self._events: deque[Event] = deque(maxlen=WAITING_EVENTS)
@@ -103,9 +118,9 @@ class Link:
         if config.connect and any(reply.ok for reply in session.liveliness().get(self.keys.alive, timeout=0.5)):
             raise LinkError(f"robot {self._robot!r}: another daemon holds {self.keys.alive}")
         drop = zenoh.CongestionControl.DROP
-        self._status = session.declare_publisher(self.keys.status, congestion_control=drop)
-        self._ticks = session.declare_publisher(self.keys.tick, congestion_control=drop)
-        self._event = session.declare_publisher(self.keys.event, congestion_control=zenoh.CongestionControl.BLOCK)
+        self._status = Outlet(session, self.keys.status, drop)
+        self._ticks = Outlet(session, self.keys.tick, drop)
+        self._event = Outlet(session, self.keys.event, zenoh.CongestionControl.BLOCK)
         self._declare(session)
 
     def close(self) -> None:
@@ -116,7 +131,7 @@ class Link:
 
     def offer(self, tick: Records) -> None:
         """Put the record of one tick (1,) into the batch; returns at once."""
-        self._rows[self._filling, self._filled] = tick[0]
+        self._bytes[self._filling, self._filled] = tick.view(np.uint8)
         self._filled += 1
         if self._filled == self._config.batch:
             self._full, self._filling, self._filled = self._filling, 1 - self._filling, 0
@@ -145,7 +160,7 @@ class Link:
             while self._events:
                 event = self._events.popleft()
                 self.history.append(event)
-                if _heard(self._event):
+                if self._event.heard:
                     await asyncio.to_thread(self._event.put, msgspec.json.encode(event))
 
     def flush(self) -> None:
@@ -160,21 +175,21 @@ class Link:
         full, self._full = self._full, None
         if full is not None:
             self._batches += 1
-            if _heard(self._ticks):
-                self._ticks.put(self._rows[full].tobytes())
-            for channel, publisher in self._produced:
+            if self._ticks.heard:
+                self._ticks.put(self._bytes[full].tobytes())
+            for channel, outlet in self._produced:
                 assert channel.produce is not None
-                if _heard(publisher):
-                    publisher.put(channel.produce())
+                if outlet.heard:
+                    outlet.put(channel.produce())
         if self._changed or (full is not None and self._batches % self._status_every == 0):
             self._changed = False
-            if _heard(self._status):
+            if self._status.heard:
                 self._status.put(msgspec.json.encode(self._doors.status()))
 
     def _declare(self, session: zenoh.Session) -> None:
         keys = self.keys
         self._produced = [
-            (channel, session.declare_publisher(channel.key, congestion_control=zenoh.CongestionControl.DROP))
+            (channel, Outlet(session, channel.key, zenoh.CongestionControl.DROP))
             for channel in self._channels
             if channel.produce is not None
         ]
@@ -184,10 +199,6 @@ class Link:
             session.declare_queryable(keys.event, history),
             session.liveliness().declare_token(keys.alive),
         ]
-
-
-def _heard(publisher: Any) -> bool:
-    return bool(publisher.matching_status.matching)
 
 
 def _one_line(error: zenoh.ZError, config: LinkConfig) -> str:

@@ -6,6 +6,8 @@ import asyncio
 import json
 import os
 import struct
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -383,6 +385,45 @@ def test_after_a_silent_network_the_sticks_have_to_be_centred(tmp_path: Path) ->
                 await talk(station, 0.0, 0.1)
                 await talk(station, 0.3, 0.2)
                 assert _asked(served) == [0.3, 0.0, 0.0]
+
+    asyncio.run(play())
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+from station.driving import Driving
+from station.joystick import Joystick
+from station.pad import PadDevice, shipped_mappings
+from station.session import connected
+with connected(sys.argv[1], sys.argv[2]) as station:
+    joystick = Joystick(station, Driving(0.5, 0.4, 1.0))
+    joystick.run(lambda: PadDevice(Path(sys.argv[3]), dict(shipped_mappings())["xpad"]), lambda _: None, lambda: True)
+"""
+
+
+def test_a_driver_s_process_that_is_killed_makes_a_walking_robot_stand(tmp_path: Path, fifo: tuple[Path, int]) -> None:
+    path, fd = fifo
+
+    async def play() -> None:
+        async with Served(make_config(command__stand_after=60.0), tmp_path) as served:
+            made = served.config
+            command = [sys.executable, "-c", DRIVER, made.robot.name, made.link.listen[0], str(path)]
+            driver = await asyncio.to_thread(subprocess.Popen, command)
+            try:
+                os.write(fd, CENTRED + button(BUMPER) + button(308) + REPORT)
+                await served.reach(Mode.STAND)
+                os.write(fd, button(B))
+                await served.reach(Mode.WALK)
+                await asyncio.sleep(0.2)
+                os.write(fd, axis(FORWARD, -32768) + REPORT)
+                await _until(lambda: _asked(served) == [0.5, 0.0, 0.0])
+                driver.kill()
+                await served.reach(Mode.STAND)
+                assert any(event.text == "the operator is gone" for event in served.daemon.link.history)
+            finally:
+                driver.kill()
+                driver.wait()
 
     asyncio.run(play())
 

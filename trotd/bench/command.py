@@ -19,6 +19,7 @@ class Section(StrEnum):
     MEMORY = "memory"
     TRAINING = "training"
     REPLAY = "replay"
+    LINK = "link"
 
 
 MODULES = {Section.SIM: "simulation"}

@@ -6,56 +6,22 @@ cyclictest (Debian's rt-tests) is the measure of what this kernel can do at all.
 
 from __future__ import annotations
 
-import contextlib
 import re
 import shutil
-import signal
-import socket
 import subprocess
-import sys
-import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 
-from runtime import config
-from runtime.recording import SUFFIX, load
-from station.session import NoAnswer, Station, StationError, connected
+from trotd.bench.daemon import PRIORITY, Disturbed, Slice, walking_daemon
 from trotd.bench.report import Figure, Finding, Missing, shown
 
-ROBOT = "stoch3"
-PRIORITY = 80
 RATES = (200.0, 500.0, 1000.0)
-WALK = 3
-"""``runtime.messages.Mode.WALK``."""
 CYCLICTEST = 2
 """s of cyclictest between two slices of the daemon."""
 TURN, SETTLE = 2.0, 0.3
 """s with a subscriber or without, and s that it may take to come or go."""
-START = 90.0
-"""s that a daemon may take to start: compiled code may have to be made anew."""
-
-
-@dataclass(frozen=True, slots=True)
-class Slice:
-    """What one slice of the daemon left."""
-
-    lateness: np.ndarray
-    """µs, one a tick."""
-    compute: np.ndarray
-    """µs."""
-    stamp: np.ndarray
-    """s monotonic."""
-    missed: int
-    ticks: int
-
-
-class Disturbed(RuntimeError):
-    """A slice that says nothing about the loop; the message says what happened in it."""
 
 
 def measure(quick: bool) -> Iterator[Finding]:
@@ -126,16 +92,20 @@ def listened_to(rate: float, turns: int) -> Iterator[Finding]:
     """Compute time of a tick with a subscriber of all ticks and without, in turns of ``TURN`` s in one daemon."""
     name = f"{rate:g} Hz: a subscriber on or off"
     stretches: list[tuple[float, bool]] = []
-    with _daemon(rate, False, round(2 * turns * TURN)) as (station, read):
+    with walking_daemon(rate, False, round(2 * turns * TURN)) as walking:
         for turn in shown(range(2 * turns), name, 2 * turns):
             on = turn % 4 in (1, 2)  # off on on off: a drift of the machine cancels
-            subscriber = station.session.declare_subscriber(station.keys.tick, lambda _sample: None) if on else None
+            subscriber = (
+                walking.station.session.declare_subscriber(walking.station.keys.tick, lambda _sample: None)
+                if on
+                else None
+            )
             time.sleep(SETTLE)
             stretches.append((time.monotonic(), on))
             time.sleep(TURN)
             if subscriber is not None:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
-    whole = read()
+    whole = walking.read()
     off, on_ = (
         float(
             np.median(
@@ -153,103 +123,9 @@ def listened_to(rate: float, turns: int) -> Iterator[Finding]:
 
 def run_daemon(rate: float, fifo: bool, seconds: int) -> Slice:
     """A daemon of its own, walking on the null body for ``seconds``; what its recording says."""
-    with _daemon(rate, fifo, seconds) as (_, read):
+    with walking_daemon(rate, fifo, seconds) as walking:
         time.sleep(seconds)
-    return read()
-
-
-@contextlib.contextmanager
-def _daemon(rate: float, fifo: bool, seconds: int) -> Iterator[tuple[Station, Callable[[], Slice]]]:
-    """A walking daemon on the null body, and what reads its recording once it was left."""
-    with tempfile.TemporaryDirectory(prefix="trotd-bench-") as folder:
-        robot = _robot_file(Path(folder), fifo, seconds)
-        endpoint = _free_endpoint()
-        command = [sys.executable, "-m", "trotd.cli", "run", "--body", "null", "--robot", str(robot)]
-        command += ["--rate-hz", f"{rate:g}", "--listen", endpoint, "--state", folder]
-        with (Path(folder) / "log").open("wb") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=log)
-        left: list[Slice] = []
-        try:
-            with _reached(process, endpoint, Path(folder) / "log") as station, _driven(station):
-                yield station, left.pop
-                process.send_signal(signal.SIGTERM)
-                process.wait(30)
-        finally:
-            process.kill()
-            process.wait()
-        left.append(_read(Path(folder), rate))
-
-
-def _read(folder: Path, rate: float) -> Slice:
-    path = max((folder / "recordings").rglob(f"*{SUFFIX}"))
-    recording = load(path)
-    faults = [event.text for event in recording.header.events if event.kind == "fault"]
-    if faults:
-        raise Disturbed(f"the daemon damped: {faults[0]}")
-    ticks = recording.ticks
-    walking = ticks[ticks["mode"] == WALK]
-    walking = walking[round(0.5 * rate) :]  # the first moments load what no tick after them loads
-    missed = int(walking["overruns"][-1]) - int(walking["overruns"][0])
-    return Slice(1e6 * walking["lateness"], 1e6 * walking["compute"], walking["stamp"], missed, len(walking))
-
-
-def _robot_file(folder: Path, fifo: bool, seconds: int) -> Path:
-    text = config.find_robot(ROBOT).read_text()
-    wishes = {"recorder": f"seconds = {seconds + 30.0}", "realtime": f"priority = {PRIORITY if fifo else 0}"}
-    for table, line in wishes.items():
-        heading = re.compile(rf"^\[{table}\]\s*(#.*)?$", re.MULTILINE)
-        key = line.partition(" ")[0]
-        if heading.search(text):
-            text = re.sub(rf"(?m)^{key} *=.*\n", "", text)
-            text = heading.sub(f"[{table}]\n{line}", text)
-        else:
-            text += f"\n[{table}]\n{line}\n"
-    path = folder / f"{ROBOT}.toml"
-    path.write_text(text)
-    config.load(path)
-    return path
-
-
-@contextlib.contextmanager
-def _reached(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> Iterator[Station]:
-    deadline = time.monotonic() + START
-    while True:
-        if process.poll() is not None:
-            raise StationError(f"the daemon ended: {log.read_text()[-500:]}")
-        try:
-            with connected(ROBOT, endpoint) as station:
-                station.next_status()
-                yield station
-                return
-        except NoAnswer:
-            raise
-        except StationError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.2)
-
-
-@contextlib.contextmanager
-def _driven(station: Station) -> Iterator[None]:
-    """Armed, stood up and walking; the operator's command is kept fresh from a thread."""
-    for word, mode in (("arm", "DAMP"), ("stand", "STAND"), ("walk", "WALK")):
-        station.ask(station.keys.mode, word.encode())
-        while station.next_status().mode != mode:
-            pass
-    done = threading.Event()
-
-    def talk() -> None:
-        publisher = station.session.declare_publisher(station.keys.velocity)
-        while not done.wait(0.05):
-            publisher.put(b'{"linear": [0.3, 0.0], "yaw_rate": 0.1}')
-
-    talker = threading.Thread(target=talk, name="operator")
-    talker.start()
-    try:
-        yield
-    finally:
-        done.set()
-        talker.join()
+    return walking.read()
 
 
 def run_cyclictest(rate: float, fifo: bool, seconds: int) -> np.ndarray:
@@ -259,12 +135,6 @@ def run_cyclictest(rate: float, fifo: bool, seconds: int) -> np.ndarray:
     answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     rows = re.findall(r"^(\d{6}) (\d+)$", answer, re.MULTILINE)
     return np.repeat([float(row[0]) for row in rows], [int(row[1]) for row in rows])
-
-
-def _free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _may_fifo() -> bool:
