@@ -181,7 +181,7 @@ def running(folder: Path, robot: Path, body: str) -> Iterator[tuple[subprocess.P
 
 @contextmanager
 def _reached(process: subprocess.Popen[str], robot: str, endpoint: str) -> Iterator[Station]:
-    end = time.monotonic() + 60.0
+    end = time.monotonic() + 240.0  # on a busy machine compiling alone takes two minutes
     while True:
         try:
             with connected(robot, endpoint) as station:

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from daemons import free_endpoint, running
 from typer.testing import CliRunner
 
-from runtime import policies
+from runtime import config, policies
+from station.push import active
 from trotd.cli import app
 
 RUN = ["--iterations", "1", "--directions", "1", "--ticks", "40", "--no-validate", "--workers", "1"]
@@ -79,3 +82,25 @@ def test_the_table_is_json_for_machines() -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["results"]["forward 2.0 m/s"]["balance"]["of"] == 1
+
+
+def test_every_iteration_is_pushed_to_the_running_robot(tmp_path: Path) -> None:
+    with running(tmp_path / "state", config.find_robot("stoch3"), "sim") as (process, station):
+        before = active(station)[1]
+        arguments = list(process.args)  # type: ignore[call-overload]
+        endpoint = arguments[arguments.index("--listen") + 1]
+        folder = tmp_path / "run"
+        code, output = call("train", "--out", str(folder), "--name", "live", "--push", "--connect", endpoint, *RUN)
+        assert code == 0, output
+        policy, digest = active(station)
+        last = (folder / "checkpoints" / "0003.json").read_bytes()
+    assert output.count("s  pushed") == 3
+    assert digest == hashlib.sha256(last).hexdigest() != before
+    assert policy.name == "live"
+
+
+def test_nobody_to_push_to_is_one_line(tmp_path: Path) -> None:
+    code, output = call("train", "--out", str(tmp_path / "run"), "--push", "--connect", free_endpoint(), *RUN)
+    assert code == 2
+    assert output.count("trotd: no daemon to talk to") == 1
+    assert not (tmp_path / "run").exists(), "nothing was begun"

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from trotd.cli_station import ENDPOINT
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -39,6 +41,7 @@ def one_line_errors() -> Iterator[None]:
 
     from runtime.config import ConfigError
     from runtime.policies import PolicyError
+    from station.session import StationError
     from training.checkpoint import RunError
     from training.inspection import NotLinear
     from training.ray_evaluator import ClusterError
@@ -47,7 +50,8 @@ def one_line_errors() -> Iterator[None]:
     try:
         yield
     except (
-        ConfigError, PolicyError, RunError, NotLinear, ReferenceMismatch, ClusterError, ImportError, ValidationError
+        ConfigError, PolicyError, RunError, NotLinear, ReferenceMismatch, ClusterError, StationError, ImportError,
+        ValidationError,
     ) as error:  # fmt: skip
         _leave(error, BAD_INPUT)
     except OSError as error:
@@ -78,6 +82,10 @@ def train(
     reference: Annotated[Path | None, typer.Option(help="A saved reference episode, instead of a new one.")] = None,
     workers: WorkersOption = 0,
     ray: Annotated[str | None, typer.Option(help="Address of a Ray cluster, instead of this machine.")] = None,
+    push: Annotated[
+        bool, typer.Option("--push", help="Send each iteration's mean to the running simulated robot: watch it learn.")
+    ] = False,
+    connect: Annotated[str, typer.Option(help="zenoh endpoint of that robot's daemon.")] = ENDPOINT,
     validate: Annotated[bool, typer.Option(help="End with the table against the MPC and the shipped policy.")] = True,
 ) -> None:
     """Learn to walk, from nothing: imitate the teacher, then learn what walking is for.
@@ -90,19 +98,20 @@ def train(
 
         config, beside = _load(robot)
         folder = RunFolder(resume or out or Path("runs") / f"{name}-{seed}")
-        if resume is not None:
-            plan = folder.plan(config_hash(config))
-        else:
-            from training.plan import make_plan
+        with _pushed(config.robot.name, connect, folder) if push else contextlib.nullcontext(_keep) as send:
+            if resume is not None:
+                plan = folder.plan(config_hash(config))
+            else:
+                from training.plan import make_plan
 
-            plan = make_plan(
-                name, config.robot.name, config_hash(config), seed, variant, start or "", paper, rough, teacher
-            )
-            plan = plan.shortened(iterations, directions, ticks)
-            folder.begin(plan, versions())
-        trainer = _trainer(config, beside, plan, folder, _reference(config, plan, reference), workers, ray)
-        checkpoint = folder.load() if resume is not None and folder.iterations() else trainer.start()
-        end = _run(trainer, plan, checkpoint)
+                plan = make_plan(
+                    name, config.robot.name, config_hash(config), seed, variant, start or "", paper, rough, teacher
+                )
+                plan = plan.shortened(iterations, directions, ticks)
+                folder.begin(plan, versions())
+            trainer = _trainer(config, beside, plan, folder, _reference(config, plan, reference), workers, ray)
+            checkpoint = folder.load() if resume is not None and folder.iterations() else trainer.start()
+            end = _run(trainer, plan, checkpoint, send)
         _finish(config, folder, trainer, end, workers, validate)
 
 
@@ -141,7 +150,30 @@ def _trainer(
     return Trainer(config, plan, folder, lambda setup: make_evaluator(setup, workers or None, ray), reference, first)
 
 
-def _run(trainer: Trainer, plan: RunPlan, checkpoint: Checkpoint) -> Checkpoint:
+def _keep(_: Row) -> str:
+    """Nothing is pushed."""
+    return ""
+
+
+@contextlib.contextmanager
+def _pushed(robot: str, endpoint: str, folder: RunFolder) -> Iterator[Callable[[Row], str]]:
+    """What sends an iteration's mean through the robot's own door for policies, and says what came of it."""
+    from station.push import send
+    from station.session import StationError, connected
+
+    with connected(robot, endpoint) as station:
+
+        def push(row: Row) -> str:
+            try:
+                reply = send(station, folder.policy_file(row.iteration).read_bytes(), immediate=True)
+            except StationError as error:
+                return f"  not pushed: {error}"
+            return "  pushed" if reply.accepted else f"  refused: {reply.reason}"
+
+        yield push
+
+
+def _run(trainer: Trainer, plan: RunPlan, checkpoint: Checkpoint, push: Callable[[Row], str]) -> Checkpoint:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -152,7 +184,7 @@ def _run(trainer: Trainer, plan: RunPlan, checkpoint: Checkpoint) -> Checkpoint:
 
         def report(row: Row) -> None:
             progress.update(bar, completed=row.iteration, description=row.stage)
-            progress.console.print(_line(row))
+            progress.console.print(_line(row) + push(row))
 
         try:
             return trainer.run(checkpoint, report)
