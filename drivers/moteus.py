@@ -112,10 +112,15 @@ class MoteusCodec:
         to_wire = np.array([1 / REVOLUTION, 1 / REVOLUTION, 1.0, REVOLUTION / servo_kp, REVOLUTION / servo_kd])
         if form == "float":
             self._to_wire = to_wire
-            self._buffer, self._frames = _float_frames(max_torque, watchdog)
+            self._buffer, frames = _float_frames(max_torque, watchdog)
         else:
             self._to_wire = to_wire / [1e-4, 2.5e-4, 0.01, 1 / 127, 1 / 127]
-            self._buffer, self._frames = _compact_frames(max_torque, watchdog)
+            self._buffer, frames = _compact_frames(max_torque, watchdog)
+            self._gains = frames["gains"]
+        self._values = frames["values"]
+        self._parts = [slice(start, start + frames.itemsize) for start in range(0, len(self._buffer), frames.itemsize)]
+        self._damping_to_wire = self._to_wire[_TORQUE] / self._to_wire[_VELOCITY]
+        self._wire, self._damped = np.empty((len(ids), 5)), np.empty(len(ids))
 
     def encode(self, commands: Array) -> list[bytes]:
         """Position-mode commands with a query behind each, one frame a servo.
@@ -127,22 +132,24 @@ class MoteusCodec:
         Raises:
             ValueError: a value is not finite (a servo would read NaN as "hold" or "full gain"), or absurd.
         """
-        sane = np.abs(commands) < _ABSURD
-        if not sane.all():
-            row, column = np.argwhere(~sane)[0]
+        wire, damped = self._wire, self._damped
+        np.absolute(commands, wire)
+        if not wire.max() < _ABSURD:
+            row, column = np.argwhere(~(wire < _ABSURD))[0]
             raise ValueError(f"command to motor {self.ids[row]}: value {column} is {commands[row, column]}")
-        wire = commands * self._to_wire
-        wire[:, _TORQUE] += commands[:, _VELOCITY] * commands[:, _KD] * self._to_wire[_TORQUE]
+        np.multiply(commands, self._to_wire, wire)
+        np.multiply(wire[:, _VELOCITY], commands[:, _KD], damped)
+        damped *= self._damping_to_wire
+        wire[:, _TORQUE] += damped
         wire[:, _VELOCITY] = 0.0
-        frames = self._frames
         if self.form == "float":
-            frames["values"] = wire
+            self._values[:] = wire
         else:
-            wire = np.rint(wire)
-            frames["values"] = np.clip(wire[:, :3], -_MAX16, _MAX16)
-            frames["gains"] = np.clip(wire[:, 3:], -_MAX8, _MAX8)
-        data, size = bytes(self._buffer), frames.itemsize
-        return [data[start : start + size] for start in range(0, len(data), size)]
+            np.rint(wire, wire)
+            self._values[:] = np.clip(wire[:, :3], -_MAX16, _MAX16)
+            self._gains[:] = np.clip(wire[:, 3:], -_MAX8, _MAX8)
+        data = bytes(self._buffer)
+        return [data[part] for part in self._parts]
 
     def motor_of(self, data: bytes) -> None:
         """The arbitration id of a reply tells its sender, not the data."""
@@ -164,7 +171,11 @@ class MoteusCodec:
 
     def to_si(self, readings: Array) -> Array:
         """Rows of ``decode`` with rad, rad/s, N·m, V and °C; NaN where a servo says "not set". Shape (n, 7)."""
-        return np.where(readings == self._not_set, np.nan, readings * self._units)
+        si: Array = readings * self._units
+        unset = readings == self._not_set
+        if unset.any():
+            si[unset] = np.nan
+        return si
 
     describe_fault = staticmethod(describe_fault)
 

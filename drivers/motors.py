@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Literal, Protocol
 
 import numpy as np
@@ -240,7 +241,7 @@ class Motors:
         self._last_sent = self._clock()
         await self.bus.cycle(frames, self._reply_time)
         self._waiting = False
-        self._si = self.codec.to_si(np.array(self._readings))
+        self._si = self.codec.to_si(as_array(self._readings))
         if len(self._answered) < 12:
             self.counters.missed += 12 - len(self._answered)
             self._missed = [0 if i in self._answered else count + 1 for i, count in enumerate(self._missed)]
@@ -309,6 +310,11 @@ class Motors:
             self._latched[index] = RESTARTED
             return RESTARTED
         return NOT_STARTING if now - self._commanding_since > START_TIME else 0
+
+
+def as_array(readings: Sequence[Reading]) -> Array:
+    """What ``decode`` gave, as ``to_si`` wants it. Shape (n, 7)."""
+    return np.fromiter(chain.from_iterable(readings), np.float64, 7 * len(readings)).reshape(-1, 7)
 
 
 _NOTHING: Reading = (0, float("nan"), float("nan"), float("nan"), float("nan"), float("nan"), 0)

@@ -17,6 +17,7 @@ class Section(StrEnum):
     TIMER = "timer"
     SIM = "sim"
     MEMORY = "memory"
+    CODECS = "codecs"
     TRAINING = "training"
     REPLAY = "replay"
     LINK = "link"
