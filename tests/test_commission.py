@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ class Operator:
         elif task.act == "stop":
             self.joints[leg, joint] = (LOWER, UPPER)[task.index][leg, joint]
         elif task.act == "jig":
-            self.joints[:] = JIG
+            self.joints[:] = task.angles
         elif task.act == "tilt":
             self.rpy = TILTS[task.index]
         elif task.act == "say":
@@ -253,7 +254,7 @@ def test_a_baseline_outlives_a_new_mount_and_not_a_new_zero(tmp_path):
     before = with_baseline(work.run(), (1.0, -2.0, 3.0, 0.5))
     work.undo("mount")
     assert carried_over(before, operator.commission(tmp_path / "progress.json").run()).contact_baseline[2] == 3.0
-    operator.joints[0, 0] += 0.1
     work = operator.commission(tmp_path / "progress.json", jig=(0.1, 0.9, -1.8))
     work.undo("zeros")
+    work._ask = lambda task: operator.do(replace(task, angles=JIG))
     assert carried_over(before, work.run()).contact_baseline == (0.0,) * 4

@@ -52,7 +52,7 @@ class Rehearsal:
         answer = {
             "turn": self._turn,
             "stop": self._stop,
-            "jig": self._stay,
+            "jig": self._fit,
             "tilt": self._tilt,
             "watch": self._let_go,
             "say": self._answer,
@@ -86,6 +86,11 @@ class Rehearsal:
         return ""
 
     def _stay(self, _task: Task) -> str:
+        self._hold(self._joints)
+        return ""
+
+    def _fit(self, task: Task) -> str:
+        self._joints[:] = task.angles
         self._hold(self._joints)
         return ""
 

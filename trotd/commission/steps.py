@@ -59,6 +59,8 @@ class Task:
     joint: int = 0
     index: int = 0
     """Which end stop, 0 or 1; which of ``POSES``."""
+    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the jig: abduction, hip, knee, rad."""
 
 
 class Readings(Protocol):
@@ -237,7 +239,7 @@ class Commission:
     def _find_zeros(self) -> None:
         progress = self.progress
         if self._jig is not None and not progress.zeros:
-            self._ask(Task("jig", f"hold all legs in the jig, at {self._jig} rad"))
+            self._ask(Task("jig", f"hold all legs in the jig, at {self._jig} rad", angles=self._jig))
             here = self._readings.motors()
             progress.jig = list(self._jig)
             progress.zeros = {
