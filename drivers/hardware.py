@@ -30,7 +30,7 @@ RANGE_MARGIN = 0.35
 CLEAR_INTERVAL = 0.2
 """s between attempts to bring back motors that latched, while the robot damps."""
 _NOT_CLEARABLE = (0, RESTARTED, SILENT)
-_QUESTIONS = 20
+_QUESTIONS, _MORE_QUESTIONS = 20, 3
 _STOPS = 3
 
 
@@ -158,8 +158,14 @@ class HardwareRobot:
         motors.reset()
         await motors.open()
         await self._ask_until_all_answered(motors.query)
+        for _ in range(_MORE_QUESTIONS):
+            await motors.query()
         silent = motors.silent(ANSWER_TIME)
         problems = [f"{motors.name(index)} does not answer: supply, cable, id?" for index in silent]
+        problems += [
+            f"{motors.name(index)}: two motors share this id; give one another (the maker's tool)"
+            for index in motors.doubled()
+        ]
         problems += self._faults()
         if not problems and not self.observe:
             await self._ask_until_all_answered(motors.stop)

@@ -87,6 +87,8 @@ NOT_STARTING = 17
 """Fault code of ours: a motor that gets commands but does not begin to obey."""
 SILENT = 18
 """Fault code of ours: a motor missed more replies in a row than are coasted over."""
+_EXTRA_REPLIES = 2
+"""One more than asked for may be the wire's doing."""
 START_TIME = 0.25
 """s that a motor may take from stopped to running."""
 
@@ -149,6 +151,7 @@ class Motors:
         self._waiting, self._last_sent = False, -np.inf
         self._running = [False] * 12
         self._missed = [0] * 12
+        self._replies, self._cycles = [0] * 12, 0
         self._commanding_since: float | None = None
         self._latched: dict[int, int] = {}
 
@@ -216,6 +219,10 @@ class Motors:
         now = self._clock()
         return [index for index, stamp in enumerate(self._stamps) if now - stamp > longer_than]
 
+    def doubled(self) -> list[int]:
+        """Indices of the motors that answered more often than they were asked: two share an id."""
+        return [index for index, count in enumerate(self._replies) if count >= self._cycles + _EXTRA_REPLIES]
+
     @property
     def all_silent(self) -> bool:
         """Whether every motor missed more replies in a row than are coasted over."""
@@ -237,6 +244,7 @@ class Motors:
 
     async def _cycle(self, frames: Sequence[Frame]) -> None:
         self._answered.clear()
+        self._cycles += 1
         self._waiting = True
         self._last_sent = self._clock()
         await self.bus.cycle(frames, self._reply_time)
@@ -261,6 +269,7 @@ class Motors:
             counters.corrupt += 1
             return False
         self._readings[index] = reading
+        self._replies[index] += 1
         if not self._waiting:
             counters.late += 1
             self._stamps[index] = self._last_sent

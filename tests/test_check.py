@@ -290,3 +290,14 @@ def test_the_table_and_its_json_say_the_same(capsys: pytest.CaptureFixture[str])
     print_table(rows, Console(width=80))
     assert "look" in capsys.readouterr().out
     assert not passed([*rows, Row("three", "fail", "gone")])
+
+
+def test_a_motor_with_an_unknown_id_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    bench.bus.servos[0, 77] = bench.bus.servos.pop((0, 13))
+    bench.servos[2].id = 77
+    monkeypatch.setattr(motors, "build_bus", lambda _bus, _motors: bench.bus)
+    wires = Wires(BusConfig(backend="virtual", channels=("a", "b", "c", "d")), motors_config(), ImuConfig())
+    rows = {row.what: row for row in asyncio.run(check_motors(CONFIG, wires))}
+    assert rows["FL knee (id 13, bus 1)"].advice == "supply, cable, id? Bus 1 has id 77 that nobody asked for"
+    assert rows["id 77, bus 1"].verdict == "warn"

@@ -192,3 +192,19 @@ def test_a_file_beside_the_robot_comes_before_a_shipped_one(tmp_path: Path) -> N
     own.write_bytes(b"{}")
     assert find_policy("balance", tmp_path) == own
     assert find_policy("balance.json") == SHIPPED / "balance.json"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": 2}, "format = 2: this program reads 1; update trotd"),
+        ({"format": 0}, "format = 0: this program reads 1; train or export it anew"),
+        ({"format": None}, "format"),
+        ({}, "missing required field `format`"),
+    ],
+)
+def test_another_versions_file_is_refused_with_its_version(change: dict[str, Any], words: str) -> None:
+    table = json.loads(find_policy("balance").read_bytes())
+    del table["format"]
+    with pytest.raises(PolicyError, match=words):
+        decode(json.dumps(table | change).encode(), "stoch3", "here")

@@ -146,3 +146,18 @@ def test_a_damaged_file_is_named_and_never_half_read(
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="No such file"):
         load(tmp_path / "nothing.trotd")
+
+
+@pytest.mark.parametrize(
+    ("mark", "words"),
+    [
+        (b"trotd recording 2\n", "version 2, this program reads 1; update trotd"),
+        (b"trotd recording 0\n", "version 0, this program reads 1; read it with the trotd that wrote it"),
+        (b"trotd recording x\n", "not a trotd recording"),
+    ],
+)
+def test_another_versions_file_is_refused_with_its_version(tmp_path: Path, mark: bytes, words: str) -> None:
+    path = tmp_path / "other.trotd"
+    path.write_bytes(mark + bytes(100))
+    with pytest.raises(RecordingError, match=words):
+        load(path)

@@ -38,7 +38,10 @@ async def check_motors(config: Config, wires: Wires) -> list[Row]:
     numbers = range(1, len(wires.bus.channels) + 1)
     try:
         bus = build_bus(wires.bus, motors)
-        found = await survey(bus, numbers, build_question(motors), sorted({motor for _, motor in wanted}))
+        question = build_question(motors)
+        found = await survey(bus, numbers, question, sorted({motor for _, motor in wanted}))
+        if not set(wanted) <= {(motor.bus, motor.id) for motor in found}:
+            found = await survey(bus, numbers, question)  # whoever is missing may have any id
     except (DriverError, ValueError) as error:
         return [Row("buses", "fail", line, "nothing was asked") for line in str(error).splitlines()]
     rows = judge_motors(wanted, found, config.limits)
@@ -61,9 +64,7 @@ def judge_motors(wanted: dict[MotorPlace, str], found: Sequence[FoundMotor], lim
         what = f"{name} (id {place[1]}, bus {place[0]})"
         motor = by_place.pop(place, None)
         if motor is None:
-            others = [str(number) for number, identifier in by_place if identifier == place[1]]
-            advice = f"it answers on bus {', '.join(others)}: plug or table?" if others else "supply, cable, id?"
-            rows.append(Row(what, "fail", "no answer", advice))
+            rows.append(Row(what, "fail", "no answer", _where_else(place, set(by_place) - set(wanted))))
         else:
             rows.append(_judge_motor(what, motor, limits))
     rows += [
@@ -74,6 +75,17 @@ def judge_motors(wanted: dict[MotorPlace, str], found: Sequence[FoundMotor], lim
     if len(firmware) > 1:
         rows.append(Row("firmware", "warn", f"the motors differ: {', '.join(firmware)}", "bring all to the newest"))
     return rows
+
+
+def _where_else(place: MotorPlace, strangers: set[MotorPlace]) -> str:
+    """Where a motor that does not answer at ``place`` may be instead."""
+    others = sorted(bus for bus, motor in strangers if motor == place[1])
+    if others:
+        return f"it answers on bus {', '.join(map(str, others))}: plug or table?"
+    neighbours = sorted(motor for bus, motor in strangers if bus == place[0])
+    if neighbours:
+        return f"supply, cable, id? Bus {place[0]} has id {', '.join(map(str, neighbours))} that nobody asked for"
+    return "supply, cable, id?"
 
 
 def _judge_motor(what: str, motor: FoundMotor, limits: LimitsConfig) -> Row:
