@@ -1,5 +1,6 @@
 # make run: the robot walks a tour in the simulator.   make run-wire: the same over the real drivers.   make test: the suite.   make check: lint, types, contracts.
 # make torture: the whole fault matrix; make torture ARGS="--row NAME --seed N": one fault again.
+# make fuzz: random and mutated bytes at every door; make fuzz ARGS="--door xbus --inputs 1000000": at one.
 # make bench: what the numbers in docs/performance.md come from.
 # Each creates the environment it needs in .venv; PYTHON names the interpreter to make it with.
 
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run run-wire test test-service test-extras check torture bench format clean
+.PHONY: run run-wire test test-service test-extras check torture fuzz bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
@@ -25,6 +26,9 @@ test-service: $(VENV)/.dev
 
 torture: $(VENV)/.dev
 	@$(BIN)/python tests/torture.py $(ARGS)
+
+fuzz: $(VENV)/.dev
+	@$(BIN)/python tests/fuzz.py $(ARGS)
 
 test-extras: $(VENV)/.extras
 	$(BIN)/pytest tests/test_training_ray.py tests/test_training_rl.py $(PYTEST_ARGS)

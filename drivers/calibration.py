@@ -34,7 +34,7 @@ class Calibration(Record, frozen=True, kw_only=True):
     robot: Name
     body: str
     """Fingerprint of the description and the motors' make that it was found with."""
-    date: datetime
+    date: Annotated[datetime, Meta(tz=True)]
     id: PerLegIds
     bus: PerLegBuses
     direction: PerLegDirections

@@ -178,7 +178,7 @@ def _advice(error: BaseException) -> str:
         errno.ENODEV: "is the adapter plugged in and its interface up? (ip link)",
         errno.EAFNOSUPPORT: "this kernel has no CAN: load can_raw, or use another back-end",
         errno.ENETDOWN: "set the interface up (deploy/networkd does it at boot)",
-    }.get(number or 0, "see docs/commissioning.md")
+    }.get(number or 0, "see docs/robots.md")
 
 
 class PythonCanBus:

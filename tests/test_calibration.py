@@ -84,6 +84,14 @@ def test_a_file_changed_by_hand_is_refused(description, tmp_path):
         load(path, description, motors_config(), NOW)
 
 
+def test_a_date_without_its_zone_is_refused(description, tmp_path):
+    path = tmp_path / "c.json"
+    save(make(description), path)
+    path.write_text(path.read_text().replace("2026-11-22T00:00:00Z", "2026-11-22T00:00:00"))
+    with pytest.raises(CalibrationError, match=r"date.*run trotd commission"):
+        load(path, description, motors_config(), NOW)
+
+
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe", b'{"version": 1}', b'{"version": "1"}'])
 def test_what_is_no_calibration_is_refused_with_what_to_do(description, tmp_path, content):
     path: Path = tmp_path / "c.json"
