@@ -18,6 +18,7 @@ from drivers.calibration import CalibrationError
 from drivers.commissioning import GRAVITY, CommissionError
 from runtime import config
 from runtime.control.contact import feel_contacts
+from runtime.control.posture import Posture
 from runtime.recording import list_recordings, load
 from runtime.replay import Player
 from sim.build import lab_build
@@ -32,7 +33,7 @@ STOCH3 = config.load(config.find_robot("stoch3"))
 
 def test_a_standing_robot_tells_what_its_legs_feign() -> None:
     """Torque sensors that are wrong by newton metres: taken off, the forces carry the weight where it is."""
-    pose = TwinWalk(quick=True).cycle.posture.folded_joints
+    pose = Posture(STOCH3.robot, STOCH3.control, STOCH3.posture).folded_joints
     walk = TwinWalk(quick=True, scenario=Scenario(noise=Noise(joint_torque_bias=1.0), joint_position=pose, seed=4))
     walk.stand()
     walk.run(1.0)
