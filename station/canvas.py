@@ -143,6 +143,11 @@ class Canvas:
         """Only where they change: modes, the solver, the clamps."""
         self._draw_state("state/MODE", ticks, [Mode(mode).name for mode in ticks["mode"].tolist()])
         self._draw_state("state/armed", ticks, ["armed" if armed else "" for armed in ticks["armed"].tolist()])
+        policies = [
+            f"{active}, from {outgoing}" if outgoing else str(active)
+            for active, outgoing in zip(ticks["policy"].tolist(), ticks["outgoing"].tolist(), strict=True)
+        ]
+        self._draw_state("state/policy", ticks, policies)
         fell_back = ticks["solver_status"] > SolverStatus.SOLVED
         names = [SolverStatus(s).name if bad else "" for s, bad in zip(ticks["solver_status"], fell_back, strict=True)]
         self._draw_state("state/solver", ticks, names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import IntEnum
 
 import msgspec
@@ -14,7 +14,7 @@ from rich.table import Table
 from drivers.robot import JOINTS, LEGS, Array
 from runtime.config import Config
 from runtime.control.records import Clamp, Records, SolverStatus
-from runtime.messages import Mode, Status
+from runtime.messages import Event, Mode, Status
 from station.session import Station
 from station.ticks import TickStream
 
@@ -78,10 +78,16 @@ class Summary(msgspec.Struct, frozen=True):
     compute_p99: float
     overruns: int
     """Deadlines missed in these ticks."""
+    policy: int
+    """Number of the active policy since the start."""
+    policy_share: float
+    """Of it in what is asked for; below one while it is blended in."""
+    events: tuple[Event, ...]
+    """What happened since the last summary."""
 
 
-def summarise(ticks: Records, peak: Array, lost: int = 0) -> Summary:
-    """Ticks (n,), n ≥ 1, of a robot whose joints bear ``peak`` (3,) N·m."""
+def summarise(ticks: Records, peak: Array, lost: int = 0, events: Iterable[Event] = ()) -> Summary:
+    """Ticks (n,), n ≥ 1, of a robot whose joints bear ``peak`` (3,) N·m, and what happened meanwhile."""
     last = ticks[-1]
     share = np.abs(ticks["joint_torque"]) / peak
     leg, joint = np.unravel_index(int(share.max(axis=0).argmax()), (4, 3))
@@ -104,6 +110,9 @@ def summarise(ticks: Records, peak: Array, lost: int = 0) -> Summary:
         lateness_p99=float(np.percentile(ticks["lateness"], 99)),
         compute_p99=float(np.percentile(ticks["compute"], 99)),
         overruns=int(last["overruns"]) - int(ticks["overruns"][0]),
+        policy=int(last["policy"]),
+        policy_share=float(last["policy_share"]),
+        events=tuple(events),
     )
 
 
@@ -116,12 +125,12 @@ def watch(station: Station, peak: Array, hz: float) -> Iterator[Summary | None]:
     with TickStream(station) as stream:
         while True:
             time.sleep(1.0 / hz)
-            ticks = stream.take()
-            yield summarise(ticks, peak, stream.lost) if len(ticks) else None
+            ticks, events = stream.take(), stream.take_events()
+            yield summarise(ticks, peak, stream.lost, events) if len(ticks) else None
 
 
-def draw_table(summary: Summary) -> Table:
-    """A summary for the terminal."""
+def draw_table(summary: Summary, lately: Iterable[Event] = ()) -> Table:
+    """A summary for the terminal, and what happened ``lately`` below it."""
     table = Table(title=f"{summary.mode}   {summary.ticks} ticks, {summary.lost} lost", show_edge=False)
     for column in ("", "asked", "applied or measured"):
         table.add_column(column, justify="right" if column else "left")
@@ -139,6 +148,10 @@ def draw_table(summary: Summary) -> Table:
         "period p50 / lateness p99, ms", f"{summary.period_p50 * 1e3:.3f}", f"{summary.lateness_p99 * 1e3:.3f}"
     )
     table.add_row("compute p99, ms / overruns", f"{summary.compute_p99 * 1e3:.3f}", str(summary.overruns))
+    table.add_row("policy, its share", str(summary.policy), f"{summary.policy_share:.0%}")
+    table.add_section()
+    for event in lately:
+        table.add_row(event.kind, f"{event.stamp - summary.stamp:+.1f} s", event.text)
     return table
 
 

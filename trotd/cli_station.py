@@ -104,7 +104,8 @@ def monitor(
     hz: Annotated[float, typer.Option(min=0.1, max=20, help="How often.")] = 2.0,
     count: Annotated[int, typer.Option(help="Stop after so many; 0 for never.")] = 0,
 ) -> None:
-    """Asked against applied, with the reason of every clamp."""
+    """Asked against applied, with the reason of every clamp, and what happened lately."""
+    from collections import deque
     from itertools import islice
 
     import msgspec
@@ -112,6 +113,7 @@ def monitor(
     from rich.console import Console
 
     from runtime import config
+    from runtime.messages import Event
     from station.monitor import draw_table, watch
     from station.session import connected
 
@@ -119,14 +121,16 @@ def monitor(
         known = config.load(config.find_robot(robot))
         peak = np.array(known.robot.joints.peak_torque)
         screen = Console()
+        lately: deque[Event] = deque(maxlen=8)
         with connected(known.robot.name, connect) as station:
             for summary in islice(watch(station, peak, hz), count or None):
+                lately.extend(summary.events if summary is not None else ())
                 if json:
                     typer.echo(msgspec.json.encode(summary).decode())
                     continue
                 if screen.is_terminal:
                     screen.clear()
-                screen.print("no ticks" if summary is None else draw_table(summary))
+                screen.print("no ticks" if summary is None else draw_table(summary, lately))
 
 
 @app.command()
