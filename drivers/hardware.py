@@ -20,8 +20,7 @@ from drivers.errors import BusTimeout, DriverError, NotConnected
 from drivers.motors import RESTARTED, SILENT, Motors, build_codec
 from drivers.pi3hat import Pi3HatBus
 from drivers.robot import JOINTS, LEGS, Array, ImuSample, JointCommand, Measurement
-from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
-from drivers.xsens import Xsens
+from drivers.wiring import BusConfig, MotorsConfig
 
 ANSWER_TIME = 0.5
 """s that a motor may take to answer at the start."""
@@ -86,23 +85,6 @@ class HardwareRobot:
         self._connected = False
         self._clear_at = -np.inf
         self._faulty = False
-
-    @classmethod
-    def build(
-        cls,
-        description: RobotDescription,
-        bus: BusConfig,
-        motors: MotorsConfig,
-        imu: ImuConfig,
-        *,
-        observe: bool = False,
-    ) -> HardwareRobot:
-        """From the wiring of a TOML.
-
-        Raises:
-            ValueError: numbers that do not fit together.
-        """
-        return cls(description, Motors(motors, build_bus(bus, motors), bus.reply_timeout), Xsens(imu), observe=observe)
 
     async def connect(self) -> None:
         """See ``Robot.connect``."""

@@ -11,6 +11,8 @@ from drivers.errors import NotConnected
 from drivers.robot import Array, ImuSample, JointCommand, JointState, Measurement, motor_torque
 
 GRAVITY = 9.81
+COMPLIANCE = 1e-6
+"""How far a joint gives under torque, rad/(N·m): no encoder stands still to the last bit under a changing one."""
 
 
 class NullRobot:
@@ -38,7 +40,7 @@ class NullRobot:
         zero = np.zeros((4, 3))
         joints = JointState(self.position.copy(), zero, zero, np.full((4, 3), 25.0), np.zeros((4, 3), np.int32), zero)
         stiff = command.kp > 0.0
-        self.position = np.where(stiff, command.position, self.position)
+        self.position = np.where(stiff, command.position + COMPLIANCE * command.torque, self.position)
         torque = np.where(stiff, motor_torque(command, joints), 0.0)
         joints = JointState(joints.position, zero, torque, joints.temperature, joints.fault, joints.age)
         imu = ImuSample(stamp, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, GRAVITY]))

@@ -83,7 +83,7 @@ class Xsens:
         self._sampled = asyncio.Event()
         self._continues = False
         self._orientation: Array | tuple[float, ...] = ()
-        self._stamp, self._arrival = -np.inf, -np.inf
+        self._stamp = -np.inf
         self._given: ImuSample | None = None
         self._lost = False
         self._keeper: asyncio.Task[None] | None = None
@@ -222,9 +222,13 @@ class Xsens:
             raise DriverError(f"IMU on {self.config.port}: no sample within {FIRST_SAMPLE_TIME} s of measuring")
 
     async def _keep_alive(self) -> None:
+        """Silence is counted in wakes without a sample: after a stall of this process what came still waits unread."""
+        silent, before = 0, -1
         while True:
             await asyncio.sleep(SILENCE / 4)
-            if not self._lost and self._clock() - self._arrival < SILENCE:
+            silent = 0 if self.counters.samples != before else silent + 1
+            before = self.counters.samples
+            if not self._lost and silent < 4:
                 continue
             self.counters.restarts += 1
             try:
@@ -245,8 +249,7 @@ class Xsens:
             counters.corrupt += 1
             return
         before, self._sample, self._given = self._sample, sample, None
-        self._arrival = self._clock()
-        self._stamp = self._device_clock.stamp(sample.ticks, self._arrival)
+        self._stamp = self._device_clock.stamp(sample.ticks, self._clock())
         elapsed = 0.0
         if self._continues and before is not None:
             counters.lost += max(0, (sample.counter - before.counter & 0xFFFF) - 1)

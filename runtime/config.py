@@ -157,6 +157,13 @@ def _contradictions(config: Config) -> Iterator[str]:
         yield f"degrade.voltage_start = {config.degrade.voltage_start}: must pass limits.min_voltage"
     if limits.stall_stand > limits.stall_damp:
         yield f"limits.stall_stand = {limits.stall_stand}: must not pass stall_damp = {limits.stall_damp}"
+    if config.bus is not None and config.motors is not None:
+        held_up = config.bus.reply_timeout + 2.0 / config.control.rate_hz
+        if held_up >= config.motors.watchdog:
+            yield (
+                f"bus.reply_timeout = {config.bus.reply_timeout}: with two ticks beside it as long as"
+                f" motors.watchdog = {config.motors.watchdog}: one lost reply would time every motor out"
+            )
     if not config.link.allow_unprotected:
         for endpoint in config.link.listen:
             if not _loopback(endpoint) and not (config.link.certificates and endpoint.startswith("tls/")):

@@ -12,6 +12,7 @@ from runtime.control.compilation import compiled
 from runtime.control.parameters import BoundsConfig
 from runtime.control.records import Clamp, Records
 from runtime.derating import derate_joint, derate_speed, ramp_up
+from runtime.encoders import look_at_encoder
 from runtime.limits import bound_command, judge_body, judge_joint, judge_load, judge_policy
 from runtime.messages import TICK_DTYPE, Evidence
 from runtime.modes import Reaction, Reason, reaction
@@ -45,6 +46,7 @@ def judge(ticks, bounds, memories, raw):  # type: ignore[no-untyped-def]
             if finite:
                 if known:
                     look_at_joint(t, b, m, leg, joint)
+                    look_at_encoder(t, b, m, leg, joint)
                     look_at_motor(t, b, m, leg, joint)
                 judge_load(t, b, m, leg, joint)
                 m.position[leg, joint], m.velocity[leg, joint] = (
@@ -216,6 +218,10 @@ class Guard:
         b["noise_share"], b["torque_share"] = _share(period, NOISE_TIME), limits.min_torque_share
         b["torque_follow"], b["rest_follow"] = _share(period, limits.torque_share_time), _share(period, REST_TIME)
         b["tracking_error"], b["tracking_time"] = limits.max_tracking_error, limits.tracking_time
+        b["stuck_time"], b["stuck_motion"] = limits.stuck_time - 0.5 * period, limits.stuck_motion
+        b["stuck_torque"], b["clamped_torque"] = limits.stuck_torque, limits.clamped_torque
+        b["stop_lower"] = np.array(description.joints.lower) + limits.joint_margin
+        b["stop_upper"] = np.array(description.joints.upper) - limits.joint_margin
         b["thermal_share"] = _share(period, limits.thermal_time)
         b["joint_velocity"] = description.joints.max_velocity
         b["peak_torque"], b["continuous_torque"] = description.joints.peak_torque, description.joints.continuous_torque
@@ -252,6 +258,7 @@ _UNITS: dict[Reason, tuple[float, int, str]] = {
     Reason.OVERLOAD: (1.0, 1, "N·m"),
     Reason.JUMPING_ENCODER: (1.0, 2, "rad"),
     Reason.NOISY_ENCODER: (1.0, 3, "rad"),
+    Reason.STUCK_ENCODER: (1e3, 0, "ms"),
     Reason.TORQUE_LOST: (1.0, 2, "of the commanded torque"),
     Reason.REVERSED_MOTOR: (1.0, 2, "of the commanded torque"),
     Reason.ASTRAY: (1.0, 2, "rad"),

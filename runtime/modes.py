@@ -63,6 +63,7 @@ class Reason(IntEnum):
     STALLED = 62
     BAD_POLICY = 63
     ASTRAY = 64
+    STUCK_ENCODER = 65
 
     @property
     def words(self) -> str:
@@ -120,6 +121,7 @@ WORDS: dict[Reason, str] = {
     Reason.STALLED: "the loop stood still",
     Reason.BAD_POLICY: "the policy asks for what cannot be",
     Reason.ASTRAY: "a joint does not follow its target",
+    Reason.STUCK_ENCODER: "an encoder does not move any more",
 }
 
 

@@ -41,7 +41,15 @@ class LimitsConfig(Record, frozen=True, kw_only=True):
     thermal_time: Positive = 30.0
     """Time constant of the rms torque that is held against the continuous rating, s."""
     joint_margin: NonNegative = 0.1
-    """How far outside its range a joint may be found at arming, rad."""
+    """How far outside its range a joint may be found at arming, and how near its end a stop may hold it, rad."""
+    stuck_time: Positive = 0.05
+    """An encoder is not suspected before not one bit of it changed for so long, s."""
+    stuck_torque: Annotated[float, Meta(gt=0, le=2)] = 0.2
+    """It is stuck when its motor's torque changed by so much meanwhile, as a share of the peak torque ..."""
+    clamped_torque: Annotated[float, Meta(gt=0, le=2)] = 0.7
+    """... (the same, where the ground or an end stop may clamp the joint) ..."""
+    stuck_motion: Angle = 0.3
+    """... or another joint of its leg by so much, rad."""
     imu_extrapolation: Annotated[int, Meta(ge=0, le=10)] = 2
     """Ticks for which a missing or unbelievable IMU sample is replaced by the last one, turned on by its own rate."""
     frozen_time: Positive = 0.05

@@ -47,6 +47,12 @@ BOUNDS_DTYPE = np.dtype(
         ("voltage_start", "f8"),
         ("soft_start", "f8"),  # ramp gained in a tick
         ("soak_keep", "f8"),
+        ("stuck_time", "f8"),
+        ("stuck_torque", "f8"),  # share of the peak torque
+        ("clamped_torque", "f8"),
+        ("stuck_motion", "f8"),
+        ("stop_lower", "f8", (4, 3)),  # between these no end stop holds a joint
+        ("stop_upper", "f8", (4, 3)),
         ("action", "f8", (18,)),
         ("joint_velocity", "f8", (3,)),
         ("peak_torque", "f8", (3,)),
@@ -89,6 +95,10 @@ MEMORY_DTYPE = np.dtype(
         ("noise", "f8", (4, 3)),  # low-passed unexplained way, rad
         ("torque_share", "f8", (4, 3)),  # low-passed measured torque over the commanded one
         ("astray", "f8", (4, 3)),  # s for which a joint has been far from its target
+        ("still", "f8", (4, 3)),  # s since the reading last changed
+        ("lowest", "f8", (4, 3)),  # torque since then, N·m
+        ("highest", "f8", (4, 3)),
+        ("still_leg", "f8", (4, 3, 3)),  # for each joint, its leg's joints then, rad
         ("commands", "f8", (2, 5, 4, 3)),  # of the last tick and the one before
         # punctuality
         ("overruns", "u4"),

@@ -19,6 +19,8 @@ class MitEmulator:
         """Knob: it neither hears nor answers."""
         self.fault = 0
         """Knob: the maker's fault code; it gives no torque while it is not 0."""
+        self.stuck_encoder = False
+        """Knob: the sensor says the same for ever, to the motor's own law too."""
         self.enabled = False
         self.position, self.velocity, self.torque, self.temperature = 0.0, 0.0, 0.0, 30.0
         self._zero = 0.0
@@ -50,11 +52,18 @@ class MitEmulator:
             self.fault = 13 if self.range.maker == "damiao" else 0
         if not self.enabled or self.fault:
             return LIMP
-        return self._drive._replace(position=self._drive.position + self._zero)
+        drive = self._drive
+        if self.stuck_encoder:
+            torque = drive.torque + drive.kp * (drive.position - self.position) + drive.kd * drive.velocity
+            return Drive(torque=max(-self.range.torque, min(self.range.torque, torque)))
+        return drive._replace(position=drive.position + self._zero)
 
     def sense(self, position: float, velocity: float, torque: float, temperature: float) -> None:
         """See ``ServoEmulator.sense``."""
-        self.position, self.velocity = position - self._zero, velocity
+        if self.stuck_encoder:
+            self.velocity = 0.0
+        else:
+            self.position, self.velocity = position - self._zero, velocity
         self.torque, self.temperature = torque, temperature
 
     def _unpack(self, data: bytes) -> Drive:

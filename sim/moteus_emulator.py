@@ -57,7 +57,7 @@ class MoteusEmulator:
         self.settings = settings or MoteusSettings()
         self.voltage = 24.0
         self.stuck_encoder = False
-        """Knob: position and velocity do not change any more."""
+        """Knob: the sensor says the same for ever, to the servo's own law too."""
         self.silent = False
         """Knob: it neither hears nor answers; its watchdog still runs."""
         self.firmware = 0x000106
@@ -102,7 +102,7 @@ class MoteusEmulator:
         elapsed, self._stepped = now - self._stepped, now
         self._advance(now)
         if self.mode in (Mode.TIMEOUT, Mode.ZERO_VELOCITY, Mode.BRAKE):
-            return Drive(kd=min(self.settings.kd / REVOLUTION, _DAMPING_TORQUE))
+            return self._sensed(Drive(kd=min(self.settings.kd / REVOLUTION, _DAMPING_TORQUE)), math.inf)
         if self.mode != Mode.POSITION:
             return LIMP
         return self._position_mode(now, elapsed)
@@ -114,6 +114,8 @@ class MoteusEmulator:
             step = self.settings.encoder_step
             self.position = round(position / REVOLUTION / step) * step + self._shift
             self.velocity = velocity / REVOLUTION
+        else:
+            self.velocity = 0.0
 
     def _advance(self, now: float) -> None:
         self._now = now
@@ -169,13 +171,22 @@ class MoteusEmulator:
         target = self._plan(target + velocity * (now - self._commanded_at), elapsed)
         bound = min(_or(command.get(Register.COMMAND_MAX_TORQUE), settings.max_torque), settings.max_torque)
         torque = _or(command.get(Register.COMMAND_TORQUE), 0.0)
-        return Drive(
+        drive = Drive(
             position=(target - self._shift) * REVOLUTION,
             velocity=velocity * REVOLUTION,
             torque=max(-bound, min(bound, torque)),
             kp=settings.kp / REVOLUTION * _or(command.get(Register.COMMAND_KP_SCALE), 1.0),
             kd=settings.kd / REVOLUTION * _or(command.get(Register.COMMAND_KD_SCALE), 1.0),
         )
+        return self._sensed(drive, bound)
+
+    def _sensed(self, drive: Drive, bound: float) -> Drive:
+        """What the law makes of the servo's own sensor: with a stuck one a torque that no motion changes."""
+        if not self.stuck_encoder:
+            return drive
+        error = drive.position - (self.position - self._shift) * REVOLUTION
+        torque = drive.torque + drive.kp * error + drive.kd * (drive.velocity - self.velocity * REVOLUTION)
+        return Drive(torque=max(-bound, min(bound, torque)))
 
     def _plan(self, target: float, elapsed: float) -> float:
         """The trajectory planner: off where both limits come negative, else it slows every change of position."""

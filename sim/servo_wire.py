@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -34,7 +33,7 @@ class ServoWire:
     def __init__(
         self,
         servos: Mapping[int, Iterable[ServoEmulator]],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
         seed: int = 0,
     ) -> None:
         self.servos = {bus: list(members) for bus, members in servos.items()}

@@ -41,8 +41,8 @@ REAL_NOISE = Noise(
     linear_acceleration_bias=0.02,
 )
 """What servos and an MTi show; the encoders' steps are the emulators'."""
-_PATIENCE = 4
-"""Ticks without frames after which the twin lives by the clock."""
+_BY_CLOCK = 4
+"""Ticks that the twin lives at once while nobody talks to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,18 +58,26 @@ class TwinSetup:
 
 
 class TwinBody:
-    """Servos and world in lock-step, without wires or pace; ``WireTwin`` adds both."""
+    """Servos and world in lock-step, without wires or pace; ``WireTwin`` adds both.
 
-    def __init__(self, world: World, setup: TwinSetup, clock: Callable[[], float] = time.monotonic) -> None:
-        """``world`` must run at ``RATE_HZ``, or at whatever rate ``step`` will be called."""
-        self.world, self.setup, self._clock = world, setup, clock
+    The servos live in the world's time: a computer that stalls is none of their business, a daemon that does is.
+    """
+
+    def __init__(self, world: World, setup: TwinSetup, clock: Callable[[], float] | None = None) -> None:
+        """``world`` must run at ``RATE_HZ``, or at whatever rate ``step`` will be called.
+
+        Another ``clock`` than the world's is for whoever holds the world still between two frames.
+        """
+        self.world, self.setup = world, setup
+        self.clock = clock or (lambda: world.time)
+        """The time, s, that the servos' watchdogs run by."""
         build = setup.build
         self.servos = [_servo(setup.motors, int(motor)) for motor in build.id.ravel()]
         """In the order of the joints, FL abduction first."""
         members: dict[int, list[ServoEmulator]] = {}
         for bus, servo in zip(build.bus.ravel(), self.servos, strict=True):
             members.setdefault(int(bus) - 1, []).append(servo)
-        self.wire = ServoWire(members, clock)
+        self.wire = ServoWire(members, self.clock)
         self.overheating: dict[int, float] = {}
         """Knob: servo's place → °C on top of what the world says."""
         self._mounting = Mounting(_conjugate(build.mount))
@@ -79,7 +87,7 @@ class TwinBody:
 
     def step(self) -> Measurement:
         """Let the world live for one of its periods under what the servos do."""
-        now = self._clock()
+        now = self.clock()
         self.measurement = self.world.step(self._command([servo.step(now) for servo in self.servos]))
         self._sense(self.measurement)
         return self.measurement
@@ -117,9 +125,13 @@ class TwinBody:
 class WireTwin:
     """A ``TwinBody`` on real channels and a real pseudo-terminal. Use inside a running loop."""
 
-    def __init__(self, world: World, setup: TwinSetup, imu_path: Path) -> None:
+    def __init__(
+        self, world: World, setup: TwinSetup, imu_path: Path, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """``clock`` is the IMU's; a real one knows nothing of the world's time."""
         self.body = TwinBody(world, setup)
         self.imu = SerialImu(imu_path, setup.product, setup.imu_baud)
+        self._clock = clock
 
     def open(self, bus: BusConfig) -> None:
         """Listen on the buses, plug in the IMU.
@@ -135,36 +147,46 @@ class WireTwin:
         self.body.wire.close()
         self.imu.unplug()
 
-    async def run(self, tick: float, after_step: Callable[[], None] = lambda: None) -> None:
+    async def run(self, tick: float, patience: float, after_step: Callable[[], None] = lambda: None) -> None:
         """Live until cancelled: one ``tick``, s, for each round of frames to all servos, or by the clock without any.
 
-        So a computer that is too slow slows the twin's time, as it slows that of ``SimRobot``, and does not fell it.
+        A round that fails to come stops the world for ``patience``, s: so long a computer that is too slow slows the
+        twin's time, as it slows that of ``SimRobot``, and does not fell it. After that the daemon counts as dead: the
+        world goes on by the clock, and the servos' watchdogs with it.
         """
-        body, ticked = self.body, self.body.wire.ticked
-        steps = max(1, round(tick / body.world.period))
+        ticked, steps, short = self.body.wire.ticked, max(1, round(tick / self.body.world.period)), _BY_CLOCK * tick
+        driven = False
         while True:
             try:
-                async with asyncio.timeout(_PATIENCE * tick):
+                async with asyncio.timeout(max(patience, short) if driven else short):
                     await ticked.wait()
-                count = steps
             except TimeoutError:
-                count = _PATIENCE * steps
+                await asyncio.sleep(0)  # after a stall of this process the frames wait unread: they come first
+                driven = ticked.is_set()
+            else:
+                driven = True
             ticked.clear()
-            for _ in range(count):
-                measurement = body.step()
-                self.imu.measure(time.monotonic(), *body.felt(measurement.imu))
-                after_step()
+            self.live(steps if driven else _BY_CLOCK * steps, after_step)
+
+    def live(self, steps: int, after_step: Callable[[], None] = lambda: None) -> None:
+        """So many steps of the world, each with its sample of the IMU."""
+        for _ in range(steps):
+            measurement = self.body.step()
+            self.imu.measure(self._clock(), *self.body.felt(measurement.imu))
+            after_step()
 
 
-async def run_twin(twin: WireTwin, bus: BusConfig, tick: float, after_step: Callable[[], None] = lambda: None) -> None:
-    """Open, live until cancelled, close.
+async def run_twin(
+    twin: WireTwin, bus: BusConfig, tick: float, patience: float = 0.0, after_step: Callable[[], None] = lambda: None
+) -> None:
+    """Open, live until cancelled (see ``WireTwin.run``), close.
 
     Raises:
         DriverError: a channel cannot be opened.
     """
     twin.open(bus)
     try:
-        await twin.run(tick, after_step)
+        await twin.run(tick, patience, after_step)
     finally:
         twin.close()
 

@@ -38,8 +38,10 @@ class XbusEmulator:
         """Knob."""
         self.silent = False
         """Knob: it hears and says nothing, as in its bootloader."""
+        self.overflowing = False
+        """Knob: its line takes less than it has to say."""
         self._parser = XbusParser()
-        self._counter = 0
+        self._counter = self._measured = 0
         self._overflowed = False
         self._next_baud = baud
 
@@ -62,8 +64,14 @@ class XbusEmulator:
         return b"".join(self._answer(message, content) for message, content in self._parser.feed(data))
 
     def measure(self, seconds: float, orientation: Array, rate: Array, acceleration: Array) -> bytes:
-        """One sample taken at ``seconds`` of its own clock, in the sensor's frame; empty unless it measures."""
+        """What it says to a sample of its base rate, taken at ``seconds`` of its own clock, in the sensor's frame.
+
+        Empty unless it measures, and where its configured rate leaves this sample out.
+        """
         if self.silent or not self.measuring:
+            return b""
+        self._measured += 1
+        if self._measured % max(1, BASE_RATE_HZ // max(1, self.rate_hz)):
             return b""
         values = {
             int(Data.PACKET_COUNTER): struct.pack(">H", self._counter),
@@ -78,7 +86,7 @@ class XbusEmulator:
             struct.pack(">HB", output.identifier, len(values[output.identifier])) + values[output.identifier]
             for output in self.outputs
         )
-        if self.rate_hz * (len(data) + 5) * 10 > self.baud:
+        if self.overflowing or self.rate_hz * (len(data) + 5) * 10 > self.baud:
             first, self._overflowed = not self._overflowed, True
             return xbus.encode(Message.ERROR, bytes([_DATA_OVERFLOW])) if first else b""
         return xbus.encode(Message.MTDATA2, data)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from twin_walk import LockstepImu
 
 from drivers import calibration
 from drivers.bus import InProcessBus
@@ -25,6 +24,7 @@ from sim.twin import RATE_HZ, TwinBody, TwinSetup
 from sim.world import World
 from trotd.commission.baseline import carried_over, with_baseline
 from trotd.commission.steps import Commission, Task
+from trotd.lockstep import LockstepImu
 
 CONFIG = config.load(config.find_robot("stoch3"))
 assert CONFIG.motors is not None

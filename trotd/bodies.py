@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from sim.world import World
 
 KINDS = ("sim", "hardware", "twin", "null")
-TWIN_MAX_AGE = 0.25
-"""The guard's bound on ages for a twin, s: what kernel workers of a busy computer keep a terminal's bytes."""
+TWIN_MAX_AGE = 1.0
+"""The guard's bound on ages and late loops for a twin, s: more than it stands still for a daemon that is held up, since
+nothing grows old in it meanwhile."""
 STALL_STAND, STALL_DAMP = 0.25, 1.0
 """The guard's bounds on a late loop for bodies that wait for it, s."""
 
@@ -49,7 +50,7 @@ def lenient(kind: str, config: Config) -> Config:
     limits = msgspec.structs.replace(
         limits,
         max_age=max(limits.max_age, TWIN_MAX_AGE if kind == "twin" else 0.0),
-        stall_stand=max(limits.stall_stand, STALL_STAND),
+        stall_stand=max(limits.stall_stand, TWIN_MAX_AGE if kind == "twin" else STALL_STAND),
         stall_damp=max(limits.stall_damp, STALL_DAMP),
     )
     if kind == "null":  # it is at once where it was told to be, without any speed

@@ -47,6 +47,10 @@ def twin(
     ] = None,
     product: Annotated[str, typer.Option(help="Of the IMU: MTI-610 (no orientation), MTI-620, MTI-630.")] = "MTI-630",
     noise: Annotated[bool, typer.Option(help="Sensors as noisy as real ones.")] = True,
+    patience: Annotated[
+        float,
+        typer.Option(min=0.0, max=10.0, help="s that its time stands still for a daemon that is held up."),
+    ] = 0.8,
     rate_hz: Annotated[float | None, typer.Option(help="The daemon's, where it is not the robot's own.")] = None,
     folder: StateOption = None,
 ) -> None:
@@ -63,7 +67,7 @@ def twin(
             raise ValueError(f"--product {product}: MTI-610, MTI-620 or MTI-630")
         changes = {} if rate_hz is None else {"control.rate_hz": rate_hz}
         loaded = config.override(config.load(config.find_robot(robot)), "command line", changes)
-        serve_twin(loaded, folder or state_folder(), connect, TwinOptions(scramble, product, noise))  # type: ignore[arg-type]
+        serve_twin(loaded, folder or state_folder(), connect, TwinOptions(scramble, product, noise, patience))  # type: ignore[arg-type]
 
 
 def check(

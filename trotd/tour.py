@@ -92,7 +92,7 @@ def _twin(robot: str, endpoint: str, arguments: Sequence[str]) -> Iterator[list[
         output = stack.enter_context(tempfile.TemporaryFile("w+"))
         toml = arguments[arguments.index("--robot") + 1]
         command = [sys.executable, "-m", "trotd.cli", "twin", "--robot", toml, "--state", folder, "--connect", endpoint]
-        command += ["--no-noise", "--rate-hz", arguments[arguments.index("--rate-hz") + 1]]
+        command += ["--rate-hz", arguments[arguments.index("--rate-hz") + 1]]
         child = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         try:
             end = time.monotonic() + START_TIMEOUT

@@ -24,13 +24,14 @@ from runtime.config import Config
 from runtime.control.posture import Posture
 from runtime.link import session_config
 from runtime.messages import Keys, MessageError
+from runtime.realtime import settle_garbage
 from sim.build import Build, build_of, lab_build, scrambled
 from sim.scenario import Noise, Scenario
 from sim.twin import RATE_HZ, REAL_NOISE, TwinSetup, WireTwin, run_twin
 from sim.world import World
 from sim.xbus_emulator import Product
 from trotd.bodies import hold_world, push_world, truth_message
-from trotd.wire import IMU_LINK, KNOWN, MEETING, favour, own_wires, twin_folder, twin_wires
+from trotd.wire import IMU_LINK, KNOWN, MEETING, TWIN_PATIENCE, favour, own_wires, twin_folder, twin_wires
 
 TRUTH_EVERY = round(RATE_HZ / 100)
 """Steps between two messages of the truth."""
@@ -47,6 +48,8 @@ class TwinOptions:
     """Seed of a body that nobody knows, which then has no calibration."""
     product: Product = "MTI-630"
     noise: bool = True
+    patience: float = TWIN_PATIENCE
+    """How long the world waits for a daemon that does not speak, s; 0 lets it go on by the clock at once."""
 
 
 def serve_twin(config: Config, folder: Path, endpoint: str, options: TwinOptions) -> None:
@@ -58,7 +61,7 @@ def serve_twin(config: Config, folder: Path, endpoint: str, options: TwinOptions
     wires = own_wires(config)
     meeting = twin_folder(folder, config.robot.name)
     meeting.mkdir(parents=True, exist_ok=True)
-    port = _free_ports(len(wires.bus.channels))
+    port = free_ports(len(wires.bus.channels))
     build = lab_build() if config.robot.name == LAB else build_of(wires.motors, wires.imu.mount)
     known = meeting / KNOWN
     known.unlink(missing_ok=True)
@@ -73,10 +76,11 @@ def serve_twin(config: Config, folder: Path, endpoint: str, options: TwinOptions
     bus = twin_wires(wires, meeting, port).bus
     place = meeting / MEETING
     favour(0)
+    settle_garbage()
     try:
         with _told(config.robot.name, endpoint, world) as tell:
             live = _live(
-                lambda: run_twin(twin, bus, 1.0 / config.control.rate_hz, tell),
+                lambda: run_twin(twin, bus, 1.0 / config.control.rate_hz, options.patience, tell),
                 lambda: place.write_text(json.dumps({"port": port})),
             )
             with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
@@ -142,7 +146,7 @@ def _told(robot: str, endpoint: str, world: World) -> Iterator[Callable[[], None
         yield tell
 
 
-def _free_ports(count: int) -> int:
+def free_ports(count: int) -> int:
     """The first of ``count`` UDP ports in a row that nobody uses now."""
     for first in range(43113, 65000, 64):
         with contextlib.ExitStack() as stack:

@@ -6,6 +6,7 @@ calibration of its body.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -15,13 +16,23 @@ import msgspec
 
 from drivers import calibration
 from drivers.errors import DriverError
-from drivers.hardware import HardwareRobot
+from drivers.hardware import HardwareRobot, build_bus
+from drivers.motors import Motors
+from drivers.robot import JointCommand, Measurement, Robot
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
+from drivers.xsens import Xsens
 from runtime.config import Config
 from runtime.messages import ArmingCheck
 
-TWIN_REPLY_TIME = 0.1
-"""How long a twin's replies are waited for, s: its process shares the computer with everybody, and its time with us."""
+TWIN_REPLY_TIME = 0.04
+"""How long a twin's replies are waited for, s: its process shares the computer with everybody, and its time with us.
+Well below the servos' watchdogs, as on a robot: a lost reply must cost a tick, not the walk."""
+TWIN_PATIENCE = 0.8
+"""How long a twin's time stands still for a daemon that this computer does not let run, s."""
+IMU_PATIENCE = 0.1
+"""How long a twin's daemon waits for the IMU's bytes of the tick before, s: a terminal's go through a worker of the
+kernel, which a busy computer keeps waiting."""
+_POLL = 2e-4
 MEETING, IMU_LINK, KNOWN = "wire.json", "imu", "calibration.json"
 _GROUPS = "239.74.163.{}"
 
@@ -80,7 +91,7 @@ def twin_wires(wires: Wires, meeting: Path, port: int) -> Wires:
     return Wires(bus, wires.motors, msgspec.structs.replace(wires.imu, port=str(meeting / IMU_LINK)))
 
 
-def wired_body(kind: str, config: Config, folder: Path, observe: bool) -> HardwareRobot:
+def wired_body(kind: str, config: Config, folder: Path, observe: bool) -> Robot:
     """The drivers on the wires, with the calibration in them.
 
     Raises:
@@ -91,7 +102,48 @@ def wired_body(kind: str, config: Config, folder: Path, observe: bool) -> Hardwa
     motors, imu = wires.motors, wires.imu
     if path.exists() or not observe:
         motors, imu = calibration.apply(calibration.load(path, config.robot, motors), motors, imu)
-    return HardwareRobot.build(config.robot, wires.bus, motors, imu, observe=observe)
+    receiver = Xsens(imu)
+    drivers = Motors(motors, build_bus(wires.bus, motors), wires.bus.reply_timeout)
+    robot = HardwareRobot(config.robot, drivers, receiver, observe=observe)
+    if kind == "twin":
+        return LockstepRobot(robot, receiver, max(1, int(imu.rate_hz / config.control.rate_hz)))
+    return robot
+
+
+class LockstepRobot:
+    """The drivers on a twin's wires: no exchange before the IMU's word of the tick before is in.
+
+    A real IMU's bytes are never late, and the real robot does not wait for them. A twin's may be by tens of ms, while
+    its servos answer at once: readings of different times, which no estimator of a robot meets.
+    """
+
+    def __init__(self, robot: HardwareRobot, imu: Xsens, samples: int) -> None:
+        """``samples`` of the IMU belong to a tick."""
+        self._robot, self._imu, self._samples = robot, imu, samples
+        self._seen = 0
+        self._silent = True
+
+    async def connect(self) -> None:
+        """See ``Robot.connect``."""
+        await self._robot.connect()
+
+    async def exchange(self, command: JointCommand) -> Measurement:
+        """See ``Robot.exchange``."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0.0 if self._silent else IMU_PATIENCE):
+                while self._packets() < self._seen + self._samples:  # noqa: ASYNC110
+                    await asyncio.sleep(_POLL)
+        packets = self._packets()
+        self._silent, self._seen = packets == self._seen, packets
+        return await self._robot.exchange(command)
+
+    async def close(self) -> None:
+        """See ``Robot.close``."""
+        await self._robot.close()
+
+    def _packets(self) -> int:
+        counters = self._imu.counters
+        return counters.samples + counters.lost + counters.corrupt + self._imu.link.corrupt
 
 
 def with_baseline(kind: str, config: Config, folder: Path) -> Config:

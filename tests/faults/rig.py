@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from twin_walk import QUICK, TwinWalk
+from twin_walk import QUICK
 
 from drivers.errors import BusTimeout, CorruptFrame
 from drivers.robot import JointCommand, Measurement, damp_command
@@ -23,6 +23,7 @@ from runtime.policies import find_policy, load
 from sim.scenario import Scenario
 from sim.twin import REAL_NOISE
 from sim.world import World
+from trotd.lockstep import TwinWalk
 
 SETTINGS = QUICK | {"limits.min_voltage": 18.0}
 """Up in a second; and a battery whose end is known."""
@@ -125,7 +126,7 @@ class WireBody:
         raise AssertionError("the in-process bus waited")
 
     def live(self) -> None:
-        self.walk._live()
+        self.walk.live()
 
 
 @dataclass
@@ -142,7 +143,7 @@ class Rig:
         """``kind`` is ``sim`` or ``wire``, ``base`` the seed of the sensors' noise."""
         if kind == "wire":
             self.config = config.override(config.load(config.find_robot("stoch3")), "test", SETTINGS)
-            walk = TwinWalk(Scenario(seed=base, noise=REAL_NOISE, joint_position=self._folded()), quick=True)
+            walk = TwinWalk(QUICK, Scenario(seed=base, noise=REAL_NOISE, joint_position=self._folded()))
             self.walk = walk
             self.config, self.cycle = walk.config, walk.cycle
             self.body: Body = WireBody(walk)

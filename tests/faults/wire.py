@@ -204,7 +204,7 @@ class ImuBytes(Fault):
     words: str
 
     def start(self, rig: Rig) -> None:
-        imu = rig.walk.imu
+        imu = rig.walk.lockstep_imu
         take, count = imu.take, 0
 
         def altered(now: float, felt: Felt) -> None:
