@@ -23,7 +23,7 @@ def look_at_encoder(t, b, m, leg, joint):  # type: ignore[no-untyped-def]
     """One finite reading against the one before: an encoder that is stuck. ``t.mode`` is still the last tick's."""
     bearing = t.mode == _STAND or t.mode == _WALK
     position, torque = t.joint_position[leg, joint], t.joint_torque[leg, joint]
-    changed = t.mode == _DAMP or position != m.position[leg, joint]
+    changed = t.mode == _DAMP or position != m.position[leg, joint] or m.still[leg, joint] < 0.0
     if changed:
         m.still[leg, joint] = -b.period
         m.lowest[leg, joint] = m.highest[leg, joint] = torque

@@ -102,7 +102,7 @@ class Guard:
         for name in ("imu", "imu_good", "imu_raw"):
             self._row[name][0] = 1.0
         self._row["felt"][2] = 9.81
-        self._row["torque_share"] = 1.0
+        self._row["torque_share"], self._row["still"] = 1.0, -1.0
         self._row["torque_bound"] = self.bounds[0]["peak_torque"]
         self._row["torque_cause"] = int(Clamp.TORQUE)
 

@@ -95,7 +95,7 @@ MEMORY_DTYPE = np.dtype(
         ("noise", "f8", (4, 3)),  # low-passed unexplained way, rad
         ("torque_share", "f8", (4, 3)),  # low-passed measured torque over the commanded one
         ("astray", "f8", (4, 3)),  # s for which a joint has been far from its target
-        ("still", "f8", (4, 3)),  # s since the reading last changed
+        ("still", "f8", (4, 3)),  # s since the reading last changed, negative before the first
         ("lowest", "f8", (4, 3)),  # torque since then, N·m
         ("highest", "f8", (4, 3)),
         ("still_leg", "f8", (4, 3, 3)),  # for each joint, its leg's joints then, rad
