@@ -20,7 +20,9 @@ from runtime.access import Role, common_name
 from runtime.control.policy import encode_policy
 from runtime.link import LinkError
 from station.keys import add_bearer, make_authority
+from station.push import known as known_policies
 from station.session import NoAnswer, Station, StationError, connected
+from station.tuning import change, known
 
 Try = Callable[[Station], Any]
 
@@ -109,6 +111,31 @@ def test_who_may_not_drive_gets_silence_and_moves_nothing(
     events = [event.text for event in served.daemon.link.history]
     assert not any("WALK" in text or "refused" in text for text in events)
     assert not served.daemon.cycle.sources.velocity.linear.any()
+
+
+def test_an_operator_sets_and_leans(bearers: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def attempt(station: Station) -> bool:
+        station.session.put(station.keys.pose, b'{"roll": 0.5, "pitch": 0, "yaw": 0, "height": 0}')
+        return change(station, "swing_height", "0.1").accepted
+
+    answer, served = serve(bearers, tmp_path, monkeypatch, "operator", attempt)
+    assert answer is True
+    wanted = {entry.name: entry.wanted for entry in served.daemon.list_tuning()}
+    assert wanted["swing_height"] == 0.1 and wanted["roll"] == 0.15
+
+
+@pytest.mark.parametrize("role", [Role.VIEWER, Role.TRAINER])
+def test_who_may_not_set_sees_what_could_be_and_changes_nothing(
+    bearers: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, role: Role
+) -> None:
+    def attempt(station: Station) -> None:
+        assert known(station) and known_policies(station)
+        station.session.put(station.keys.pose, b'{"roll": 0.5, "pitch": 0, "yaw": 0, "height": 0}')
+        with pytest.raises(NoAnswer, match="may not ask"):
+            station.ask(station.keys.change_tuning, b'{"name": "swing_height", "value": 0.1}', timeout=1.0)
+
+    _, served = serve(bearers, tmp_path, monkeypatch, role.value, attempt)
+    assert all(entry.wanted == entry.own for entry in served.daemon.list_tuning())
 
 
 @pytest.mark.parametrize("role", [Role.VIEWER, Role.OPERATOR])

@@ -319,6 +319,17 @@ def test_a_leans_the_standing_body_and_the_gait_button_changes_the_gait(tmp_path
     assert "the sticks move the body" in said and any(words.startswith("gait walk: gait = walk") for words in said)
 
 
+async def _walk_forward(served: Served, fd: int) -> None:
+    """Stand up, walk, and push the stick."""
+    os.write(fd, CENTRED + button(BUMPER) + button(308) + REPORT)
+    await served.reach(Mode.STAND)
+    os.write(fd, button(B))
+    await served.reach(Mode.WALK)
+    await asyncio.sleep(0.2)
+    os.write(fd, axis(FORWARD, -32768) + REPORT)
+    await _until(lambda: _asked(served) == [0.5, 0.0, 0.0])
+
+
 def test_a_pad_that_is_pulled_out_makes_a_walking_robot_stand_and_nothing_moves_when_it_is_back(tmp_path: Path) -> None:
     path = tmp_path / "event0"
 
@@ -332,13 +343,7 @@ def test_a_pad_that_is_pulled_out_makes_a_walking_robot_stand_and_nothing_moves_
             fd = plug()
             driver = asyncio.get_running_loop().create_task(served.client(lambda s: drive(s, path, done)))
             try:
-                os.write(fd, CENTRED + button(BUMPER) + button(308) + REPORT)
-                await served.reach(Mode.STAND)
-                os.write(fd, button(B))
-                await served.reach(Mode.WALK)
-                await asyncio.sleep(0.2)
-                os.write(fd, axis(FORWARD, -32768) + REPORT)
-                await _until(lambda: _asked(served) == [0.5, 0.0, 0.0])
+                await _walk_forward(served, fd)
                 path.unlink()
                 os.close(fd)  # the last writer: the pad is gone
                 await served.reach(Mode.STAND)
@@ -411,16 +416,10 @@ def test_a_driver_s_process_that_is_killed_makes_a_walking_robot_stand(tmp_path:
             command = [sys.executable, "-c", DRIVER, made.robot.name, made.link.listen[0], str(path)]
             driver = await asyncio.to_thread(subprocess.Popen, command)
             try:
-                os.write(fd, CENTRED + button(BUMPER) + button(308) + REPORT)
-                await served.reach(Mode.STAND)
-                os.write(fd, button(B))
-                await served.reach(Mode.WALK)
-                await asyncio.sleep(0.2)
-                os.write(fd, axis(FORWARD, -32768) + REPORT)
-                await _until(lambda: _asked(served) == [0.5, 0.0, 0.0])
+                await _walk_forward(served, fd)
                 driver.kill()
                 await served.reach(Mode.STAND)
-                assert any(event.text == "the operator is gone" for event in served.daemon.link.history)
+                await _until(lambda: any("operator is gone" in e.text for e in served.daemon.link.history))
             finally:
                 driver.kill()
                 driver.wait()
