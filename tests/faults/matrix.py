@@ -108,7 +108,7 @@ def silence(servo: Any) -> None:
 
 def knock(draw: Draw) -> Push:
     side = float(draw.choice([-1.0, 1.0]))
-    return Push((within(draw, -200, 200), side * within(draw, 500, 900), 0.0), 0.2)
+    return Push((within(draw, -150, 150), side * within(draw, 250, 600), 0.0), 0.2)
 
 
 def wild(draw: Draw) -> WildPolicy:
