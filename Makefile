@@ -1,6 +1,7 @@
 # make run: the robot walks a tour in the simulator.   make run-wire: the same over the real drivers.   make test: the suite.   make check: lint, types, contracts.
 # make torture: the whole fault matrix; make torture ARGS="--row NAME --seed N": one fault again.
 # make fuzz: random and mutated bytes at every door; make fuzz ARGS="--door xbus --inputs 1000000": at one.
+# make soak: an hour of walking with everybody watching.   make soak-sim HOURS=24: simulated hours of commands and pushes.
 # make bench: what the numbers in docs/performance.md come from.
 # Each creates the environment it needs in .venv; PYTHON names the interpreter to make it with.
 
@@ -10,7 +11,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run run-wire test test-service test-extras check torture fuzz bench format clean
+.PHONY: run run-wire test test-service test-extras check torture soak soak-sim fuzz bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
@@ -32,6 +33,12 @@ fuzz: $(VENV)/.dev
 
 test-extras: $(VENV)/.extras
 	$(BIN)/pytest tests/test_training_ray.py tests/test_training_rl.py $(PYTEST_ARGS)
+
+soak: $(VENV)/.dev
+	@$(BIN)/python tests/soak.py daemon $(ARGS)
+
+soak-sim: $(VENV)/.dev
+	@$(BIN)/python tests/soak.py sim --hours $(or $(HOURS),24) $(ARGS)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

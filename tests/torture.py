@@ -2,59 +2,21 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from faults.matrix import BY_NAME, ROWS
 from faults.report import print_json, print_outcome, print_table, shown, worst
 from faults.run import BASES, BODIES, GAITS, Case, replay, run_trunk, trunks
-from faults.watch import Outcome
+from faults.workers import spread
 
 FAILED, BAD_INPUT = 1, 2
 WIRE_SHARE = 0.5
 """Seeds on the twin for each one on the simulator: it is five times slower."""
-
-
-def work(portions: Any, results: Any) -> None:
-    """A worker: one robot after another until there are none left."""
-    for portion in iter(portions.get, None):
-        run_trunk(portion, results.put)
-    results.put(None)
-    results.close()
-    results.join_thread()
-    os._exit(0)  # the solvers' bindings have much to say about an interpreter that ends
-
-
-def run(cases: Sequence[Case], jobs: int) -> list[Outcome]:
-    """All ``cases``, in worker processes of their own."""
-    context = multiprocessing.get_context("spawn")
-    portions, results = context.Queue(), context.Queue()
-    for portion in trunks(cases):
-        portions.put(portion)
-    workers = [context.Process(target=work, args=(portions, results), daemon=True) for _ in range(jobs)]
-    for worker in workers:
-        portions.put(None)
-        worker.start()
-    try:
-        return list(shown(_collected(results, jobs), "faults", len(cases)))
-    finally:
-        for worker in workers:
-            worker.terminate()
-            worker.join()
-
-
-def _collected(results: Any, jobs: int) -> Any:
-    while jobs:
-        outcome = results.get()
-        if outcome is None:
-            jobs -= 1
-        else:
-            yield outcome
 
 
 def plan(rows: Sequence[str], seeds: int, first: int, bodies: Sequence[str], brief: bool = False) -> list[Case]:
@@ -113,7 +75,10 @@ def main(
     else:
         cases = plan(row or list(BY_NAME), seeds, first, bodies) if sample is None else pick(sample)
         order = {(case.body, case.gait, case.row, case.seed): place for place, case in enumerate(cases)}
-        outcomes = sorted(run(cases, jobs), key=lambda o: order[o.body, o.gait, o.row, o.seed])
+        outcomes = sorted(
+            shown(spread(trunks(cases), run_trunk, jobs), "faults", len(cases)),
+            key=lambda o: order[o.body, o.gait, o.row, o.seed],
+        )
         (print_json if json else print_table)(outcomes)
     if keep is not None:
         keep.write_bytes(worst(outcomes))

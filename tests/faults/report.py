@@ -6,7 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from rich.console import Console
@@ -21,18 +21,21 @@ SILENCE = 60.0
 """s between two lines of progress where there is no terminal."""
 
 
-def shown(outcomes: Iterable[Outcome], words: str, total: int) -> Iterator[Outcome]:
+Result = TypeVar("Result")
+
+
+def shown(outcomes: Iterable[Result], words: str, total: int) -> Iterator[Result]:
     """``outcomes`` behind a progress bar on the error stream, or a line a minute where that is no terminal."""
     console, bad, told = Console(stderr=True), 0, time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(words, total=total)
         for count, outcome in enumerate(outcomes, 1):
-            bad += bool(outcome.violations)
-            progress.update(task, advance=1, description=f"{words}, {bad} violations")
+            bad += any(bool(getattr(outcome, name, ())) for name in ("violations", "falls"))
+            progress.update(task, advance=1, description=f"{words}, {bad} bad")
             if not console.is_terminal and time.monotonic() - told > SILENCE:
                 told = time.monotonic()
-                sys.stderr.write(f"{count} of {total} {words}, {bad} violations\n")
+                sys.stderr.write(f"{count} of {total} {words}, {bad} bad\n")
             yield outcome
 
 
