@@ -104,8 +104,8 @@ def _print_hours(results: list[Wandering], failed: list[Wandering]) -> None:
     )
     console.print(
         f"falls {sum(len(r.falls) for r in results)} · commands not finite {sum(r.not_finite for r in results)}"
-        f""
-        f" · past the torque limit {sum(r.over_limit for r in results)} · largest torque {max(r.torque for r in results):.1f} N·m"
+        f" · past the torque limit {sum(r.over_limit for r in results)}"
+        f" · largest torque {max(r.torque for r in results):.1f} N·m"
     )
     console.print(f"other ends in damp: {faults or 'none'}")
     for result in failed:

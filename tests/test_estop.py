@@ -23,6 +23,8 @@ WAYS: dict[str, list[Request | Mode | int]] = {
     "down while it folds": [Request.ARM, Request.STAND, 5, Request.SIT, 2, Request.STAND, 3, Request.SIT, Mode.DAMP],
 }
 """What is asked, the mode that is then waited for, or ticks that go by."""
+ARMABLE = 120
+"""Ticks that the arming list wants to have seen."""
 
 
 class Robot:
@@ -30,7 +32,8 @@ class Robot:
 
     def __init__(self) -> None:
         config = make_config()
-        self.body, self.cycle, self.twin = Probe(config), *(Cycle(config, make_policy()) for _ in range(2))
+        policy = make_policy(config.robot.name)
+        self.body, self.cycle, self.twin = Probe(config), *(Cycle(config, policy) for _ in range(2))
         asyncio.run(self.body.connect())
         self.command = damp_command(1.0)
         self.index, self.stopped = 0, 0
@@ -68,7 +71,8 @@ class Robot:
 
 
 def go(robot: Robot, way: list[Request | Mode | int], each: Callable[[], None]) -> None:
-    robot.tick()
+    for _ in range(ARMABLE):
+        robot.tick()
     for act in way:
         if isinstance(act, Request):
             answer, words = robot.cycle.request(act, robot.measurement)

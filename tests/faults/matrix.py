@@ -222,7 +222,7 @@ ROWS: tuple[Row, ...] = (
         lambda d: FlippedImu(int(d.integers(2))),
         lambda d: wire.ImuBytes(wire.Flip(int(d.integers(2))), "flipped"),
         "damp",
-        3,
+        4,
     ),
     Row(
         "imu_bias",

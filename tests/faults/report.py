@@ -95,8 +95,8 @@ def print_table(outcomes: Sequence[Outcome]) -> None:
     console.print(table)
     console.print(
         "evidence, answer: latest tick after the injection in which a reading broke a bound, and in which the robot"
-        " damped or sat down; N·m, rad/s: largest torque and joint speed after it; impact: fastest touch of the ground,"
-        " m/s"
+        " damped, sat down or stopped; N·m, rad/s: largest torque and joint speed after it; impact: fastest touch of"
+        " the ground, m/s"
     )
     failed = [outcome for outcome in outcomes if outcome.violations]
     for outcome in failed[:SHOWN]:

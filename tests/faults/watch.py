@@ -40,7 +40,7 @@ class Outcome(msgspec.Struct, kw_only=True):
     noticed: int | None = None
     """Tick in which the daemon first said that something was wrong."""
     answered: int | None = None
-    """Tick in which it damped, or sat down."""
+    """Tick in which it left its mode: damped, sat down, or stopped its walk."""
     torque: float = 0.0
     """Largest that a motor exerted after the fault, N·m."""
     speed: float = 0.0
@@ -83,6 +83,7 @@ class Watch:
     def __init__(self, rig: Rig, outcome: Outcome) -> None:
         self.rig, self.outcome = rig, outcome
         self.ticks = 0
+        self._mode = rig.mode
         self._peak = np.array(rig.config.robot.joints.peak_torque)
         self._down = 0.0
         self._speed = float(np.linalg.norm(rig.world.truth.linear_velocity))
@@ -99,7 +100,7 @@ class Watch:
             outcome.evidence = self.ticks
         if outcome.noticed is None and (rig.cycle.health or rig.cycle.state.fault):
             outcome.noticed = self.ticks
-        if outcome.answered is None and rig.mode not in GOING:
+        if outcome.answered is None and rig.mode is not self._mode:
             outcome.answered = self.ticks
         if rig.cycle.events and not outcome.words:
             said = [event.text for event in rig.cycle.events if event.kind == "fault"]
