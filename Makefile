@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run run-wire test test-service test-extras check torture soak soak-sim fuzz bench format clean
+.PHONY: run run-wire test test-service test-network test-arm64 test-extras check torture soak soak-sim fuzz bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
@@ -24,6 +24,12 @@ test: $(VENV)/.dev
 
 test-service: $(VENV)/.dev
 	tests/service.sh
+
+test-network: $(VENV)/.dev
+	$(BIN)/pytest tests/test_network.py
+
+test-arm64:
+	tests/arm64.sh
 
 torture: $(VENV)/.dev
 	@$(BIN)/python tests/torture.py $(ARGS)

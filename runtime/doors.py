@@ -23,6 +23,7 @@ import zenoh
 from runtime import messages, policies
 from runtime.config import Config
 from runtime.control.records import VelocityCommand
+from runtime.delays import Delays
 from runtime.messages import (
     FaultRecord,
     Keys,
@@ -108,6 +109,7 @@ class Entrance:
         """The sticks were not centred since commands came again."""
         self.drivers: set[str] = set()
         """Liveliness tokens of the drivers that are there."""
+        self._delays = Delays()
 
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Open every door; needs the running loop."""
@@ -170,6 +172,9 @@ class Entrance:
         if message.sticks and not self._centred(stamp, message):
             message = VelocityMessage((0.0, 0.0), 0.0)
         self._heard = stamp
+        sent = sample.timestamp
+        if sent is not None:  # it counts from when it was sent: after a gap, what waited comes at once
+            stamp -= self._delays.lateness(str(sent.get_id()), sent.get_time().timestamp(), stamp)
         waiting, self._newest = self._newest, VelocityCommand(stamp, np.array(message.linear), message.yaw_rate)
         if waiting is None:
             self._cross(self._take_newest)

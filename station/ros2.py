@@ -18,6 +18,7 @@ import numpy as np
 import zenoh
 
 from runtime.control.parameters import BoundsConfig
+from runtime.delays import Delays
 from runtime.messages import VelocityMessage
 from station import cdr
 from station.cdr import CdrError
@@ -27,11 +28,9 @@ from station.session import Station, StationError, session_config
 from station.ticks import TickStream
 
 LATE = 0.2
-"""s; a command that took so much longer than the quickest one is not a wish of now."""
+"""s; a command that took so much longer than its publisher's quickest is not a wish of now."""
 FORGET = 1e-3
-"""s a second, by which the quickest is believed less: clocks drift apart."""
-PUBLISHERS = 16
-"""Whose quickest command is remembered."""
+"""s a second, by which the quickest tick is believed less: clocks drift apart."""
 COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
 Message = dict[str, Any]
 
@@ -108,7 +107,7 @@ class Steering:
         """``taken``, ``clipped`` and the reasons of those that were not taken."""
         self._station = station
         self._bounds = (*bounds.linear_velocity, bounds.yaw_rate)
-        self._quickest: dict[bytes, tuple[float, float]] = {}
+        self._delays = Delays()
         self._token: Any = None
         self._lock = threading.Lock()
 
@@ -116,7 +115,7 @@ class Steering:
         """One message of ``kind``. On zenoh's threads."""
         with self._lock:
             try:
-                velocity = self._read(kind, sample, time.time())
+                velocity = self._read(kind, sample, time.monotonic())
             except CdrError:
                 self.counts["not a message of its type"] += 1
                 return
@@ -130,23 +129,14 @@ class Steering:
             attachment = decode_attachment(b"" if sample.attachment is None else sample.attachment.to_bytes())
         except ValueError as error:
             raise Refused("without rmw_zenoh's attachment") from error
-        self._check_age(attachment, now)
+        if self._delays.lateness(attachment.gid, attachment.stamp / NANOSECONDS, now) > LATE:
+            raise Refused("late")
         message = cdr.decode(kind, sample.payload.to_bytes())
         twist = message.twist if kind == COMMANDS[1] else message
         velocity = np.array((twist.linear.x, twist.linear.y, twist.angular.z))
         if not np.isfinite(velocity).all():
             raise Refused("not finite")
         return velocity
-
-    def _check_age(self, attachment: Attachment, now: float) -> None:
-        delay = now - attachment.stamp / NANOSECONDS
-        quickest, when = self._quickest.pop(attachment.gid, (delay, now))
-        quickest = min(delay, quickest + FORGET * (now - when))
-        self._quickest[attachment.gid] = (quickest, now)
-        while len(self._quickest) > PUBLISHERS:
-            del self._quickest[next(iter(self._quickest))]
-        if delay - quickest > LATE:
-            raise Refused("late")
 
     def _take(self, velocity: np.ndarray) -> None:
         if self._token is None:  # from now on the robot stands when this process is gone

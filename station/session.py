@@ -49,6 +49,7 @@ def session_config(endpoint: str) -> zenoh.Config:
         ("connect/endpoints", [endpoint]),
         ("scouting/multicast/enabled", False),
         ("scouting/gossip/enabled", False),
+        ("timestamping/enabled", True),  # the daemon tells by it what waited on the way
         ("transport/shared_memory/enabled", False),  # gains nothing below 2 kB; a confined service may not have it
     ):
         config.insert_json5(key, json.dumps(value))

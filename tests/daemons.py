@@ -19,7 +19,7 @@ import msgspec
 from drivers.null import NullRobot
 from drivers.robot import JointCommand, Measurement
 from runtime import config, policies
-from runtime.config import Config
+from runtime.config import ROBOTS, Config
 from runtime.control.policy import Policy
 from runtime.control.posture import Posture
 from runtime.cycle import Wake
@@ -191,3 +191,12 @@ def _reached(process: subprocess.Popen[str], robot: str, endpoint: str) -> Itera
         except StationError:
             assert process.poll() is None and time.monotonic() < end, "the daemon does not come up"
             time.sleep(0.1)
+
+
+def quick_robot(folder: Path, more: str = "") -> Path:
+    """The TOML of a Stoch3 that stands up quickly, with ``more`` tables."""
+    text = (ROBOTS / "stoch3.toml").read_text()
+    posture = "\n".join(f"{key.partition('.')[2]} = {value}" for key, value in QUICK.items() if "posture" in key)
+    path = folder / "stoch3.toml"
+    path.write_text(f"{text}\n[posture]\n{posture}\n{more}")
+    return path

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemons import QUICK, running
+from daemons import quick_robot, running
 from hypothesis import given
 from hypothesis import strategies as st
 from walks import Walk
 
 from runtime import crash
-from runtime.config import ROBOTS
 from runtime.messages import Event, Mode, ModeReply, Request
 from runtime.recorder import EVENT_DTYPE, EVENTS, Recorder, event_row
 from runtime.recording import SUFFIX, list_recordings, load
@@ -155,18 +154,9 @@ def test_more_events_than_there_is_room_for(tmp_path: Path) -> None:
 # A daemon of its own --------------------------------------------------------------------------------------------------
 
 
-def _robot(folder: Path) -> Path:
-    """Stoch3 that stands up quickly."""
-    text = (ROBOTS / "stoch3.toml").read_text()
-    posture = "\n".join(f"{key.partition('.')[2]} = {value}" for key, value in QUICK.items() if "posture" in key)
-    path = folder / "stoch3.toml"
-    path.write_text(f"{text}\n[posture]\n{posture}\n")
-    return path
-
-
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_walk_that_is_killed_is_there_at_the_next_start(tmp_path: Path, number: signal.Signals) -> None:
-    robot = _robot(tmp_path)
+    robot = quick_robot(tmp_path)
     with running(tmp_path, robot, "null") as (process, station):
         for wish, mode in ((Request.ARM, "DAMP"), (Request.STAND, "STAND"), (Request.WALK, "WALK")):
             end = time.monotonic() + 60.0
