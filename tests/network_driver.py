@@ -53,6 +53,7 @@ def obey(hands: Hands, joystick: Joystick, done: threading.Event) -> None:
             hands.press(word)
         status: Any = joystick.status
         known = {"mode": status.mode if status else "", "deaf": joystick.deaf, "latency": joystick.latency}
+        known["moves"] = bool(status) and any(status.velocity_command)
         print(json.dumps(known | {"words": joystick.words}), flush=True)
     done.set()
 
