@@ -276,25 +276,29 @@ class Entrance:
     def _answer_policy(self, query: zenoh.Query) -> None:
         """What is active, at once; what became of a candidate, when it is known: nobody else waits for that."""
         data, rollback = _payload(query, policies.LARGEST_FILE + 1), "rollback" in query.parameters
-        done: Future[Outcome] = Future()
         try:
             if not data and not rollback:
                 with query:
                     query.reply(self._keys.policy, self._wait(self._doors.active_policy).data)
                 return
-            if rollback:
-                self._wait(lambda: self._doors.roll_back(done))
-            else:
-                file = self._verified(data)
-                immediate = "immediate" in query.parameters
-                self._wait(lambda: self._doors.offer_policy(file, immediate, done))
+            file = None if rollback else self._verified(data)
+            immediate = "immediate" in query.parameters
+            self._wait(lambda: self._offer(file, immediate, query))
         except policies.PolicyError as error:
-            done.set_result(Outcome(False, str(error), {}))
+            outcome = Outcome(False, str(error), {})
+            self._wait(lambda: self._reply_policy(query, outcome))
         except Exception as error:
             with query:
                 query.reply_err(str(error).encode())
-            return
-        done.add_done_callback(lambda outcome: self._loop.run_in_executor(None, self._reply_policy, query, outcome))
+
+    def _offer(self, file: PolicyFile | None, immediate: bool, query: zenoh.Query) -> None:
+        """On the loop: hand the candidate over, or roll back; the answer leaves from the loop too, when it is known."""
+        done: Future[Outcome] = Future()
+        if file is None:
+            self._doors.roll_back(done)
+        else:
+            self._doors.offer_policy(file, immediate, done)
+        done.add_done_callback(lambda settled: self._reply_policy(query, settled.result()))
 
     def _verified(self, data: bytes) -> PolicyFile:
         policy = policies.decode(data, self._config.robot.name, "candidate")
@@ -303,11 +307,10 @@ class Entrance:
         )
         return PolicyFile(policy, data)
 
-    def _reply_policy(self, query: zenoh.Query, done: Future[Outcome]) -> None:
-        outcome = done.result()
+    def _reply_policy(self, query: zenoh.Query, outcome: Outcome) -> None:
         if not outcome.accepted:
             self._refuse(self._keys.policy, outcome.words)
-        active = self._wait(self._doors.active_policy)
+        active = self._doors.active_policy()
         reply = PolicyReply(outcome.accepted, active.policy.name, active.sha256, outcome.words, outcome.report)
         with query:
             query.reply(self._keys.policy, msgspec.json.encode(reply))

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trotd.bench import command, qp, report, tick
+from runtime.messages import TICK_DTYPE, Mode
+from trotd.bench import command, link, qp, report, tick
 from trotd.bench.corpus import KINDS, Corpus
 from trotd.bench.exact import constraints, exact_forces, is_minimum
 
@@ -109,3 +110,18 @@ def test_without_the_tests_the_plain_form_is_missing_and_not_an_error(monkeypatc
 def test_bars_are_not_drawn_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(report.shown(range(3), "counting", 3)) == [0, 1, 2]
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_command_counts_from_its_sending_to_the_first_tick_that_follows_it() -> None:
+    ticks = np.zeros(6, TICK_DTYPE)
+    ticks["stamp"] = np.arange(6) * 0.005
+    ticks["asked_velocity"][:, 0] = (0.0, 0.1, 0.1, 0.3, 0.3, 0.3)
+    sent = {0.1: 0.003, 0.2: 0.011, 0.3: 0.012}  # the second was overtaken before a tick took it
+    assert list(link._applied(ticks, sent)) == pytest.approx([0.002, 0.003])
+
+
+def test_an_e_stop_counts_to_the_first_damping_command_after_it() -> None:
+    ticks = np.zeros(4, TICK_DTYPE)
+    ticks["stamp"], ticks["compute"] = np.arange(4) * 0.005, 1e-4
+    ticks["mode"] = (Mode.DAMP, Mode.WALK, Mode.WALK, Mode.DAMP)
+    assert link._damped(ticks, 0.006) == pytest.approx(0.0151)

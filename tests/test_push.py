@@ -93,6 +93,18 @@ def test_a_second_one_waits_and_a_rollback_gives_the_first_up(tmp_path: Path) ->
     assert served.daemon.cycle.policy.name == "balance" and not kept(tmp_path)
 
 
+def test_a_daemon_that_stops_in_the_shadow_tells_who_waits(tmp_path: Path) -> None:
+    async def script(served: Served) -> None:
+        await served.stand()
+        waiting = asyncio.get_running_loop().create_task(sent(served))
+        await served.until(lambda: served.daemon.audition.stage is Stage.SHADOW)
+        served.daemon.stop()
+        reply = await waiting
+        assert not reply.accepted and reply.reason == "the daemon is stopping"
+
+    assert serve(tmp_path, script).daemon.cycle.generation == 1
+
+
 def test_rolling_back_takes_the_last_one_that_proved_good_and_keeps_that(tmp_path: Path) -> None:
     async def script(served: Served) -> None:
         nothing = await served.client(roll_back)

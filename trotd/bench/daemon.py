@@ -19,6 +19,7 @@ import numpy as np
 
 from runtime import config
 from runtime.control.records import Records
+from runtime.messages import ModeReply
 from runtime.recording import SUFFIX, load
 from station.session import NoAnswer, Station, StationError, connected
 
@@ -26,7 +27,9 @@ ROBOT = "stoch3"
 PRIORITY = 80
 WALK = 3
 """``runtime.messages.Mode.WALK``."""
-START = 90.0
+PATIENCE = 20.0
+"""s for which a refused request is asked again."""
+START = 240.0
 """s that a daemon may take to start: compiled code may have to be made anew."""
 
 
@@ -144,9 +147,17 @@ def _reached(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> Iter
 
 
 def set_off(station: Station) -> None:
-    """Arm, stand up and walk."""
+    """Arm, stand up and walk; what is refused is asked again for a while.
+
+    Raises:
+        StationError: it is refused still.
+    """
     for word, mode in (("arm", "DAMP"), ("stand", "STAND"), ("walk", "WALK")):
-        station.ask(station.keys.mode, word.encode())
+        deadline = time.monotonic() + PATIENCE
+        while not (reply := station.ask_for(ModeReply, station.keys.mode, word.encode())).accepted:
+            if time.monotonic() > deadline:
+                raise StationError(f"{word}: {reply.reason}")
+            time.sleep(0.05)
         while station.next_status().mode != mode:
             pass
 
