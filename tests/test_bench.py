@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from runtime.messages import TICK_DTYPE, Mode
-from trotd.bench import command, link, qp, report, tick
+from trotd.bench import command, link, qp, report, senses, tick
 from trotd.bench.corpus import KINDS, Corpus
 from trotd.bench.exact import constraints, exact_forces, is_minimum
 
@@ -125,3 +125,9 @@ def test_an_e_stop_counts_to_the_first_damping_command_after_it() -> None:
     ticks["stamp"], ticks["compute"] = np.arange(4) * 0.005, 1e-4
     ticks["mode"] = (Mode.DAMP, Mode.WALK, Mode.WALK, Mode.DAMP)
     assert link._damped(ticks, 0.006) == pytest.approx(0.0151)
+
+
+def test_the_senses_on_a_noisy_twin_hold_their_bounds() -> None:
+    found = [finding for finding in senses.measure(quick=True) if isinstance(finding, report.Figure)]
+    assert len(found) == 6
+    assert [figure.name for figure in found if figure.met is False] == []

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from twin_walk import QUICK
 
+from drivers.errors import DriverError
+from drivers.robot import JOINTS, LEGS
 from runtime import config
 from runtime.messages import Mode, Request
 from runtime.modes import Reason
-from sim.build import build_of, lab_build, scrambled
+from sim.build import Build, build_of, lab_build, scrambled
+from sim.mit_emulator import MitEmulator
 from trotd.lockstep import TwinWalk
 
 COASTED_TICKS = 2
@@ -155,3 +159,60 @@ def test_the_twins_table_is_the_labs_in_another_form():
     assert sorted(other.id.ravel()) == sorted(lab.id.ravel())
     assert (other.id != lab.id).any()
     assert np.linalg.norm(other.mount) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("place", [0, 4, 8])
+def test_a_stuck_encoder_is_found_in_a_walk_before_the_robot_falls(standing: TwinWalk, place: int):
+    standing.ask(Request.WALK)
+    standing.run(0.6, (0.4, 0.0, 0.0))
+    standing.cycle.events.clear()
+    standing.twin.servos[place].stuck_encoder = True  # type: ignore[attr-defined]
+    assert standing.ticks_to_damp(velocity=(0.4, 0.0, 0.0)) <= 20
+    assert not standing.world.fallen()
+    assert reason(standing) in (Reason.STUCK_ENCODER, Reason.TORQUE_LOST, Reason.ASTRAY)
+    assert f"{LEGS[place // 3]} {JOINTS[place % 3]}" in standing.faults[0]
+
+
+def test_a_stuck_encoder_does_not_push_a_folded_leg_up(standing: TwinWalk):
+    lying = TwinWalk(QUICK)
+    lying.run(0.6)
+    lying.twin.servos[8].stuck_encoder = True  # type: ignore[attr-defined]
+    lying.ask(Request.ARM, Request.STAND)
+    assert lying.ticks_to_damp(200) < 200
+    assert lying.world.truth.position[2] < 0.5 * standing.world.truth.position[2]
+    assert "BL knee" in lying.faults[0]
+
+
+def wrong(joint: tuple[int, int], **factor: float) -> Build:
+    """The lab's build, but one joint's number other than the driver believes."""
+    build = lab_build()
+    for name, value in factor.items():
+        table = getattr(build, name).copy()
+        table[joint] *= value
+        build = replace(build, **{name: table})
+    return build
+
+
+@pytest.mark.parametrize("joint", [(0, 1), (0, 2), (1, 0)])
+@pytest.mark.parametrize("factor", [{"direction": -1.0}, {"offset": -1.0}, {"gear": 3.0}])
+def test_a_wrong_number_in_the_drivers_table_shows(joint: tuple[int, int], factor: dict[str, float]):
+    """The twin turns as its own table says: were it the driver's, two wrongs would look right."""
+    try:
+        walk = TwinWalk(QUICK, build=wrong(joint, **factor))
+    except DriverError as error:
+        assert f"{LEGS[joint[0]]} {JOINTS[joint[1]]} reads" in str(error)
+        return
+    if abs(walk.measurement.joints.position - walk.world.truth.joint_position)[joint] > 0.1:
+        return
+    walk.run(0.6)  # folded, this motor stands where its joint's angle does not depend on the number: it has to move
+    walk.ask(Request.ARM, Request.STAND)
+    assert walk.ticks_to_damp(400) < 400
+    assert walk.faults
+
+
+def test_a_knob_of_a_mit_motor_holds_its_reading_and_its_law():
+    motor = MitEmulator(1, "AK80-8")
+    motor.sense(0.5, 1.0, 0.0, 30.0)
+    motor.stuck_encoder = True
+    motor.sense(0.9, 1.0, 0.0, 30.0)
+    assert (motor.position, motor.velocity) == (0.5, 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,18 @@ class WireWalk(TwinWalk):
             if self.imu.counters.samples + self.imu.link.corrupt > before:
                 return
 
+    def unplug(self) -> None:
+        """Pull the IMU's cable."""
+        self.do(self._in_loop(self.wires.imu.unplug))
+
+    def plug_in(self) -> None:
+        """Put it back."""
+        self.do(self._in_loop(self.wires.imu.plug_in))
+
+    @staticmethod
+    async def _in_loop(act: Callable[[], None]) -> None:
+        act()
+
     def __enter__(self) -> WireWalk:
         return self
 
@@ -92,9 +104,6 @@ class WireWalk(TwinWalk):
     def close(self) -> None:
         """Leave the wires."""
         self.do(self.robot.close())
-        self.do(self._leave())
+        self.do(self._in_loop(self.wires.close))
         self.loop.close()
         self.world.close()
-
-    async def _leave(self) -> None:
-        self.wires.close()

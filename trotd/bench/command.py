@@ -21,6 +21,7 @@ class Section(StrEnum):
     TRAINING = "training"
     REPLAY = "replay"
     LINK = "link"
+    SENSES = "senses"
 
 
 MODULES = {Section.SIM: "simulation"}
