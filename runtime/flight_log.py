@@ -83,8 +83,6 @@ class FlightLog:
         yield
         if self._outlives and (self._ended or not self.recorder.count):
             shutil.rmtree(self._memory, ignore_errors=True)
-            with contextlib.suppress(OSError):
-                self._memory.parent.rmdir()  # unless another robot is at home there
 
     def _new_recorder(self) -> Recorder:
         def create(ring: Path | None) -> Recorder:

@@ -6,8 +6,12 @@ import contextlib
 import fcntl
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
+
+OWNER = "state"
+"""In a folder in memory: the path of the state folder that it belongs to."""
 
 
 class AlreadyRunning(RuntimeError):
@@ -48,10 +52,10 @@ def memory_folder(state: Path) -> Path:
     """Where that lies which must outlive the process but need not outlive the machine's power.
 
     systemd's RUNTIME_DIRECTORY, ``$XDG_RUNTIME_DIR/trotd``, or ``/dev/shm/trotd-<uid>``, all kept in RAM; in it a
-    folder of its own for every state folder.
+    folder of its own for every state folder. What belongs to a state folder that is gone is removed.
 
     Raises:
-        OSError: it is somebody else's.
+        OSError: it is somebody else's, or cannot be made.
     """
     if granted := os.environ.get("RUNTIME_DIRECTORY"):
         root = Path(granted.partition(":")[0])
@@ -62,4 +66,11 @@ def memory_folder(state: Path) -> Path:
     root.mkdir(mode=0o700, parents=True, exist_ok=True)
     if root.is_symlink() or root.stat().st_uid != os.getuid():
         raise PermissionError(f"{root} is not a folder of this user: remove it")
-    return root / hashlib.sha256(os.fsencode(state.resolve())).hexdigest()[:12]
+    state.mkdir(parents=True, exist_ok=True)
+    for owner in root.glob(f"*/{OWNER}"):
+        if not Path(owner.read_text()).is_dir():
+            shutil.rmtree(owner.parent, ignore_errors=True)
+    folder = root / hashlib.sha256(os.fsencode(state.resolve())).hexdigest()[:12]
+    folder.mkdir(mode=0o700, exist_ok=True)
+    (folder / OWNER).write_text(str(state.resolve()))
+    return folder

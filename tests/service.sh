@@ -66,6 +66,7 @@ inside kill -9 "$main"
 back=$((($(date +%s%N) - began) / 1000000))
 say "back in DAMP and reachable after $back ms"
 [ $back -le 3000 ] || say "slower than the 3000 ms that are wanted"
+"$here/.venv/bin/python" "$here/tests/service_drive.py" recovered || fail "what the killed run left is not whole"
 
 if inside /broken/deploy/systemd/install.sh --extras sim; then fail "a broken version was accepted"; fi
 [ "$(inside readlink /opt/trotd/current)" = "$good" ] || fail "not back at the version before"

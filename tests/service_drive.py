@@ -1,12 +1,21 @@
-"""From outside the service's machine: walk it, or wait until it is back in damp (tests/service.sh)."""
+"""From outside the service's machine: walk it, wait for it in damp, look at what it kept (tests/service.sh)."""
 
 from __future__ import annotations
 
 import json
 import sys
+import tempfile
 import time
+from pathlib import Path
 
-from runtime.messages import ModeReply, Request
+import msgspec
+
+from runtime import config, policies
+from runtime.control.policy import encode_policy
+from runtime.messages import Mode, ModeReply, RecordingEntry, Request
+from runtime.recording import load
+from runtime.replay import replay
+from station.push import active, known, send
 from station.session import Station, StationError, connected
 
 DEADLINE = 60.0
@@ -26,14 +35,52 @@ def walk(station: Station) -> None:
     while station.next_status().mode != "STAND":
         if time.monotonic() > end:
             raise StationError("does not stand up")
+    reply = send(station, candidate())
+    if not reply.accepted:
+        raise StationError(f"policy: {reply.reason}")
     ask(station, Request.WALK)
-    for _ in range(100):
-        station.session.put(station.keys.velocity, json.dumps({"linear": [0.4, 0.0], "yaw_rate": 0.0}))
-        time.sleep(0.02)
+    end = time.monotonic() + DEADLINE
+    count = 0
+    while count < 100 or not proven(station):  # a policy is kept for the next start once it has walked
+        if time.monotonic() > end:
+            raise StationError("the policy is not kept")
+        for _ in range(20):
+            station.session.put(station.keys.velocity, json.dumps({"linear": [0.4, 0.0], "yaw_rate": 0.0}))
+            time.sleep(0.02)
+            count += 1
     status = station.next_status()
     if status.mode != "WALK":
         raise StationError(f"{status.mode}: {status.reason}")
-    print(f"walks at {status.velocity[0]:.2f} m/s")
+    print(f"walks at {status.velocity[0]:.2f} m/s under {status.policy}")
+
+
+def candidate() -> bytes:
+    """A policy of another name than the shipped one."""
+    policy = policies.load(policies.find_policy(config.load(config.find_robot("stoch3")).control.policy), "stoch3")
+    return encode_policy(msgspec.structs.replace(policy, name="candidate"))
+
+
+def proven(station: Station) -> bool:
+    return any(entry.role == "kept" and entry.name == "candidate" for entry in known(station))
+
+
+def recovered(station: Station) -> None:
+    """The last good policy is active, and the recording of the run that was killed is whole to its last tick."""
+    name, _ = active(station)
+    if name.name != "candidate":
+        raise StationError(f"policy {name.name} is active")
+    entries = station.ask_for(list[RecordingEntry], station.keys.recording)
+    crashed = [entry for entry in entries if entry.name.endswith("-crash.trotd")]
+    if not crashed:
+        raise StationError("no recording of the crash")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / crashed[-1].name
+        path.write_bytes(station.ask(station.keys.recording, parameters=f"name={path.name}", timeout=60.0))
+        recording = load(path)
+        result = replay(recording)
+    if recording.ticks["mode"][-1] != Mode.WALK or result.difference is not None:
+        raise StationError(f"{path.name}: ends in mode {recording.ticks['mode'][-1]}; {result.difference}")
+    print(f"{path.name}: {len(recording.ticks)} ticks up to the walk's last, bit for bit the same in replay")
 
 
 def damped(_station: Station) -> None:
@@ -44,7 +91,7 @@ def damped(_station: Station) -> None:
 
 
 def main() -> int:
-    act = {"walk": walk, "damped": damped}[sys.argv[-1]]
+    act = {"walk": walk, "damped": damped, "recovered": recovered}[sys.argv[-1]]
     end = time.monotonic() + DEADLINE
     while True:
         try:

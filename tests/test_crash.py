@@ -19,6 +19,7 @@ from runtime.messages import Event, Mode, ModeReply, Request
 from runtime.recorder import EVENT_DTYPE, EVENTS, Recorder, event_row
 from runtime.recording import SUFFIX, list_recordings, load
 from runtime.replay import replay
+from runtime.state import OWNER, memory_folder
 
 
 def left_by(walk: Walk, memory: Path) -> None:
@@ -186,4 +187,18 @@ def test_a_walk_that_is_killed_is_there_at_the_next_start(tmp_path: Path, number
     np.testing.assert_array_equal(recording.ticks["asked_velocity"][-1], [0.3, 0.0, 0.0])
     result = replay(recording)
     assert result.difference is None and result.ticks == len(recording.ticks) - 1
-    assert list((tmp_path / "run").rglob("*")) == [], "a run that ends in order leaves nothing in memory"
+    left = [file for file in (tmp_path / "run").rglob("*") if file.is_file()]
+    assert [file.name for file in left] == [OWNER], "a run that ends in order leaves nothing in memory"
+
+
+def test_what_belongs_to_a_state_folder_that_is_gone_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    states = [tmp_path / "a", tmp_path / "b"]
+    gone, kept = (memory_folder(state) for state in states)
+    for folder in (gone, kept):
+        (folder / "robot").mkdir()
+    states[0].rmdir()
+    assert memory_folder(states[1]) == kept
+    assert not gone.exists() and (kept / "robot").is_dir()
