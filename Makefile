@@ -2,6 +2,7 @@
 # make torture: the whole fault matrix; make torture ARGS="--row NAME --seed N": one fault again.
 # make fuzz: random and mutated bytes at every door; make fuzz ARGS="--door xbus --inputs 1000000": at one.
 # make soak: an hour of walking with everybody watching.   make soak-sim HOURS=24: simulated hours of commands and pushes.
+# make failsafe: docs/failsafe.md from its table.   make mutation: every guard taken out once; at least one test must see it.
 # make bench: what the numbers in docs/performance.md come from.
 # Each creates the environment it needs in .venv; PYTHON names the interpreter to make it with.
 
@@ -11,7 +12,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: run run-wire test test-service test-network test-arm64 test-extras check torture soak soak-sim fuzz bench format clean
+.PHONY: run run-wire test test-service test-network test-arm64 test-extras check torture soak soak-sim fuzz failsafe mutation bench format clean
 
 run: $(VENV)/.sim
 	@$(BIN)/trotd tour
@@ -51,6 +52,12 @@ check: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
+
+failsafe: $(VENV)/.dev
+	@$(BIN)/python -m runtime.failsafe > docs/failsafe.md
+
+mutation: $(VENV)/.dev
+	@$(BIN)/python tests/mutation.py
 
 bench: $(VENV)/.dev
 	@$(BIN)/trotd bench

@@ -6,6 +6,7 @@ calls it on the robot, tests and replays call it on anything.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ EVENTS = 256
 
 _DAMP, _STAND_UP, _STAND, _WALK, _SIT_DOWN = Mode  # an enum's attribute costs a microsecond before Python 3.12
 _OK, _SOLVER_FAILED, _OPERATOR_LOST = Reason.OK, Reason.SOLVER_FAILED, Reason.OPERATOR_LOST
+_UPRIGHT = (_STAND, _WALK)
 _FAILED = int(SolverStatus.FAILED)
 _DEADMAN = int(Clamp.DEADMAN)
 _PLAN_FIELDS = ("velocity_command", "observation", "asked", "action", "phase", "stance", "touchdown", "foot_targets")
@@ -183,12 +185,11 @@ class Cycle:
         walk_lost = wake.stamp - sources.velocity.stamp > self.config.command.stand_after
         before = self.state
         answer = self.guard.reaction(verdict) if verdict is not _OK else Reaction.NONE
-        settled = before.mode is not _STAND or self._settled()
+        settled = before.mode not in _UPRIGHT or self._settled(before.mode)
         self.state = modes.advance(before, verdict, sources.posture.finished, walk_lost, answer, settled)
         self._changed(before, measurement)
-        command = sources.step(
-            self.state.mode, wake.stamp, measurement, self.guard.imu_believed, self.guard.speed_share
-        )
+        share = 0.0 if modes.stopping(self.state) else self.guard.speed_share
+        command = sources.step(self.state.mode, wake.stamp, measurement, self.guard.imu_believed, share)
         command = self._bounded(command, measurement)
         self._note_command(command)
         return command
@@ -213,7 +214,7 @@ class Cycle:
             self.checks = self.examine()
             ready = all(check.ok for check in self.checks)
         settled = bool(self._views["stance"].all())
-        answer = modes.request(before, wish, self.verdict, ready, settled)
+        answer = modes.request(before, wish, self.verdict, ready, settled, self._settled(_WALK))
         self.state = answer.state
         words = answer.reason.words
         if answer.reason is Reason.NOT_READY and not ready:
@@ -236,7 +237,7 @@ class Cycle:
         return (*own, *self.outside())
 
     def lose_operator(self, measurement: Measurement | None) -> None:
-        """The driver has gone: a walking robot stands."""
+        """The driver has gone: a walking robot stops and stands."""
         before = self.state
         self.state = modes.lose_operator(before)
         if measurement is not None:
@@ -265,10 +266,13 @@ class Cycle:
         tick = self.tick[0]
         self.events.append(Event(stamp=float(tick["stamp"]), tick=int(tick["index"]), kind=kind, text=text))
 
-    def _settled(self) -> bool:
-        """Whether it stood on all four and still a tick ago."""
-        twist = self._views["twist"]
-        return bool(self._views["stance"].all()) and float(np.hypot(twist[0], twist[1])) < STILL
+    def _settled(self, mode: Mode) -> bool:
+        """Whether it stood on all four and still a tick ago, or walked slowly enough to stand."""
+        x, y = self._views["twist"][:2].tolist()
+        speed = math.hypot(x, y)
+        if mode is _WALK:
+            return speed < self.config.command.stand_speed
+        return speed < STILL and bool(self._views["stance"].all())
 
     def _begin(self, wake: Wake) -> None:
         row = self._row
@@ -339,7 +343,7 @@ class Cycle:
         vector = self._views["asked_velocity"]
         vector[:2], vector[2] = asked.linear, asked.yaw_rate
         bits = int(row["clamps"]) | self.guard.marks | sources.marks
-        if state.reason is _OPERATOR_LOST and state.mode is _STAND:
+        if state.reason is _OPERATOR_LOST and state.mode in _UPRIGHT:
             bits |= _DEADMAN
         row["clamps"] = bits
         while bits:
@@ -353,7 +357,7 @@ class Cycle:
         """Give up for ``reason``; an armed robot keeps it as the fault that stands."""
         before = self.state
         answer = self.guard.reaction(reason)
-        settled = before.mode is _STAND and self._settled()
+        settled = before.mode is not _STAND or self._settled(_STAND)
         self.state = modes.advance(before, reason, False, False, answer, settled)
         if self.state is not before:
             self._stand_fault(before, words)

@@ -2,7 +2,7 @@
 
 DAMP → STAND_UP → STAND ⇄ WALK, STAND → SIT_DOWN → DAMP, and DAMP from anywhere. Only an armed robot leaves DAMP, and
 every way into DAMP disarms. A fault that leaves the legs answering sits a standing robot down; one that leaves the
-controller whole stops a walking one first. All others damp. Every fault stays until ``clear``.
+controller whole lets a walking one stop first. All others damp. Every fault stays until ``clear``.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ class Reason(IntEnum):
     OPERATOR_LOST = 8
     STOPPING = 9
     LATE_LOOP = 10
+    SLOWING = 11
+    STOPPED = 12
 
     NOT_ARMED = 20
     NOT_STANDING = 21
@@ -88,6 +90,8 @@ WORDS: dict[Reason, str] = {
     Reason.OPERATOR_LOST: "the operator is gone",
     Reason.STOPPING: "the daemon is stopping",
     Reason.LATE_LOOP: "the loop came too late to walk on",
+    Reason.SLOWING: "asked to stand: slowing down first",
+    Reason.STOPPED: "stopped",
     Reason.NOT_ARMED: "not armed: ask for arm first",
     Reason.NOT_STANDING: "not standing: ask for stand first",
     Reason.NOT_DAMPED: "only in damp",
@@ -139,7 +143,9 @@ class Reaction(IntEnum):
     DAMP = 4
 
 
-STOPPED = frozenset({Reason.HOT_MOTOR, Reason.OVERLOAD, Reason.LOW_VOLTAGE})
+HALTS = frozenset({Reason.OPERATOR_LOST, Reason.LATE_LOOP, Reason.SLOWING})
+"""Why a walking robot stops without a fault."""
+WHOLE = frozenset({Reason.HOT_MOTOR, Reason.OVERLOAD, Reason.LOW_VOLTAGE})
 """Faults that leave every leg answering and the controller whole."""
 SEATED = frozenset(
     {
@@ -163,7 +169,7 @@ def reaction(reason: Reason, sit_down: bool) -> Reaction:
         return Reaction.NONE
     if reason is Reason.LATE_LOOP:
         return Reaction.STAND
-    if sit_down and reason in STOPPED:
+    if sit_down and reason in WHOLE:
         return Reaction.STOP_AND_SIT
     return Reaction.SIT_DOWN if sit_down and reason in SEATED else Reaction.DAMP
 
@@ -217,7 +223,9 @@ TABLE: dict[Request, dict[Mode, Entry]] = {
 """Requests that move the robot. The other three do not need a table: arm and clear work in DAMP only, damp always."""
 
 
-def request(state: ModeState, wish: Request, verdict: Reason, ready: bool, settled: bool = True) -> Answer:
+def request(
+    state: ModeState, wish: Request, verdict: Reason, ready: bool, settled: bool = True, slow: bool = True
+) -> Answer:
     """The answer to ``wish``.
 
     Args:
@@ -226,6 +234,7 @@ def request(state: ModeState, wish: Request, verdict: Reason, ready: bool, settl
         verdict: of the guard, OK or a fault.
         ready: nothing speaks against arming.
         settled: all four legs carry; a robot that stands on two of them does not sit down.
+        slow: a walking robot may stand at once, without slowing down first.
     """
     match wish:
         case Request.DAMP:
@@ -236,6 +245,8 @@ def request(state: ModeState, wish: Request, verdict: Reason, ready: bool, settl
             return _arm(state, verdict, ready)
         case Request.SIT if state.mode is Mode.STAND and not settled:
             return _refused(state, Reason.STILL_MOVING)
+        case Request.STAND if state.mode is Mode.WALK and not slow and state.fault is Reason.OK:
+            return Answer(replace(state, reason=Reason.SLOWING), True, Reason.SLOWING)
         case Request.STAND | Request.WALK | Request.SIT:
             return _move(state, TABLE[wish][state.mode], verdict)
         case _:
@@ -258,38 +269,48 @@ def advance(
         finished: the posture of STAND_UP or SIT_DOWN has reached its end.
         command_lost: no velocity command for longer than the configuration allows.
         answer: what a verdict that is not OK leads to.
-        settled: a robot in STAND stands on all four and still.
+        settled: a robot in STAND stands on all four and still; one in WALK is slow enough to stand.
     """
     if verdict is not Reason.OK and (state.armed or state.mode is not Mode.DAMP):
         given_up = _give_up(state, verdict, answer, settled)
         if given_up.mode is not state.mode or given_up.mode is Mode.DAMP:
             return given_up
         state = given_up
-    if state.mode is Mode.STAND and state.fault is not Reason.OK and settled:
+    if settled and stopping(state):
+        return replace(
+            state, mode=Mode.STAND, reason=Reason.STOPPED if state.reason is Reason.SLOWING else state.reason
+        )
+    if settled and state.mode is Mode.STAND and state.fault is not Reason.OK:
         return replace(state, mode=Mode.SIT_DOWN)
     if state.mode is Mode.STAND_UP and finished:
         return replace(state, mode=Mode.STAND, reason=Reason.STOOD_UP)
     if state.mode is Mode.SIT_DOWN and finished:
         return _damped(state, Reason.SAT_DOWN)
-    if state.mode is Mode.WALK and command_lost:
+    if state.mode is Mode.WALK and command_lost and settled:
         return replace(state, mode=Mode.STAND, reason=Reason.COMMAND_LOST)
     return state
 
 
+def stopping(state: ModeState) -> bool:
+    """Whether a walking robot is on its way to standing and follows no velocity any more."""
+    return state.mode is Mode.WALK and (state.fault is not Reason.OK or state.reason in HALTS)
+
+
 def lose_operator(state: ModeState) -> ModeState:
-    """The state after a driver has gone: a walking robot stands."""
-    return replace(state, mode=Mode.STAND, reason=Reason.OPERATOR_LOST) if state.mode is Mode.WALK else state
+    """The state after a driver has gone: a walking robot stops and stands."""
+    walks = state.mode is Mode.WALK and state.fault is Reason.OK
+    return replace(state, reason=Reason.OPERATOR_LOST) if walks else state
 
 
 def _give_up(state: ModeState, verdict: Reason, answer: Reaction, settled: bool) -> ModeState:
     mode = state.mode
     if answer is Reaction.STAND:
-        return replace(state, mode=Mode.STAND, reason=verdict) if mode is Mode.WALK else state
+        return replace(state, reason=verdict) if mode is Mode.WALK and not stopping(state) else state
     unsteady = mode is Mode.WALK or (mode is Mode.STAND and not settled)
     if answer is Reaction.DAMP or mode is Mode.DAMP or (unsteady and answer is Reaction.SIT_DOWN):
         return replace(_damped(state, verdict), fault=verdict)
     fault = verdict if state.fault is Reason.OK else state.fault
-    to = Mode.STAND if unsteady else Mode.SIT_DOWN
+    to = mode if unsteady else Mode.SIT_DOWN
     return state if state.fault is fault and mode is to else replace(state, mode=to, reason=verdict, fault=fault)
 
 

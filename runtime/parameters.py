@@ -146,6 +146,8 @@ class CommandConfig(Record, frozen=True, kw_only=True):
     """Older ones are ramped to zero, s."""
     stand_after: Positive = 2.0
     """Without any for so long, WALK becomes STAND, s."""
+    stand_speed: Positive = 0.3
+    """A walking robot that is faster slows down before it stands, m/s."""
 
 
 class DampConfig(Record, frozen=True, kw_only=True):

@@ -39,6 +39,8 @@ LONGEST_GAP = 3.0
 """Ticks between two samples over which rate of turn and attitude can still be compared."""
 TURNING_TIME = 0.05
 """s over which a rate of turn explains a change of attitude at most."""
+PROMPT = 0.9
+"""Ticks within which a motor must have answered for its torque to be held against its command."""
 MOVING = 0.3
 """rad/s: a joint that is faster moves."""
 PLAY = 0.05
@@ -220,7 +222,7 @@ def look_at_motor(t, b, m, leg, joint):  # type: ignore[no-untyped-def]
     )
     wanted = min(peak, max(-peak, wanted))
     share = 1.0
-    if abs(wanted) > TELLING_TORQUE and t.joint_age[leg, joint] <= b.period:
+    if abs(wanted) > TELLING_TORQUE and t.joint_age[leg, joint] < PROMPT * b.period:
         share = min(2.0, max(-1.0, t.joint_torque[leg, joint] / wanted))
         m.torque_share[leg, joint] += (share - m.torque_share[leg, joint]) * b.torque_follow
     else:

@@ -166,6 +166,8 @@ class Player:
         """The requests that made ``tick`` out of ``before``, as far as the tick itself does not."""
         changed = any(before[name] != tick[name] for name in ("mode", "armed", "reason"))
         reason, mode = int(tick["reason"]), Mode(int(tick["mode"]))
+        if changed and reason == Reason.SLOWING and before["reason"] != reason:
+            yield Request.STAND
         if not changed or reason not in (Reason.REQUESTED, Reason.ARMED, Reason.CLEARED):
             return
         faulty = self.cycle.state.fault is not Reason.OK

@@ -13,6 +13,7 @@ from runtime.messages import Mode
 
 COMMAND_FIELDS = ("position", "velocity", "kp", "kd", "torque")
 _DAMP, _STAND_UP, _STAND, _WALK, _SIT_DOWN = Mode  # an enum's attribute costs a microsecond before Python 3.12
+_STOPPING = int(Clamp.STOPPING)
 _EXPIRED, _SPEED, _BLEND, _FALLBACK = int(Clamp.EXPIRED), int(Clamp.SPEED), int(Clamp.BLEND), int(Clamp.FALLBACK)
 _LEAST_SQUARES = int(SolverStatus.LEAST_SQUARES)
 
@@ -54,7 +55,7 @@ class Sources:
             now: s monotonic.
             measurement: as the guard believes it.
             believed: its attitude can be computed with.
-            share: of the commanded velocity that may be followed.
+            share: of the commanded velocity that may be followed; 0 where the robot is to stop.
         """
         self.marks = 0
         if mode is _STAND or mode is _WALK:
@@ -110,6 +111,10 @@ class Sources:
         """The newest velocity, or rest once it is too old; the controller bounds how fast it is followed."""
         if now - self.velocity.stamp > self._expiry:
             self.marks |= _EXPIRED
+            self.velocity = VelocityCommand(stamp=self.velocity.stamp)
+            return self.rest
+        if share == 0.0:
+            self.marks |= _STOPPING
             self.velocity = VelocityCommand(stamp=self.velocity.stamp)
             return self.rest
         velocity = self.velocity

@@ -40,6 +40,7 @@ CLAMP_WORDS = {
     Clamp.BLEND: "hand-over between two commands",
     Clamp.COASTED: "a motor's reading older than a tick",
     Clamp.EXTRAPOLATED: "IMU sample carried on by its rate",
+    Clamp.STOPPING: "stopping: at rest instead of the velocity asked",
 }
 """Every bit of ``clamps`` as people would say it."""
 

@@ -210,7 +210,8 @@ def test_a_fault_that_leaves_the_controller_whole_stops_a_walking_robot_before_i
     bench.walk()
     bench.body.change = lambda m: spoil(m, temperature=np.full((4, 3), 90.0))
     bench.tick()
-    assert bench.cycle.state.mode is Mode.STAND and bench.cycle.state.fault is Reason.HOT_MOTOR
+    assert bench.cycle.state.mode is Mode.STAND, "the null body is never fast"
+    assert bench.cycle.state.fault is Reason.HOT_MOTOR
     assert bench.ask(Request.WALK) == (False, Reason.FAULT_STANDS.words)
     bench.reach(Mode.SIT_DOWN)
     bench.reach(Mode.DAMP)

@@ -103,7 +103,7 @@ def test_a_policy_that_came_in_the_middle_is_used_from_its_tick_on(tmp_path: Pat
 def test_another_policy_is_compared_and_the_same_one_does_not_differ(walked: Recording) -> None:
     policy = msgspec.json.decode(walked.header.policy.encode(), type=Policy)
     same = compare_policy(walked, policy)
-    assert same.shift == same.force == same.torque == 0.0 and same.ticks == 800
+    assert same.shift == same.force == same.torque == 0.0 and same.ticks >= 800
     assert same.clamped_before == same.clamped_now
     halved = tuple(tuple(0.5 * value for value in row) for row in policy.matrix)
     assert compare_policy(walked, msgspec.structs.replace(policy, matrix=halved)).force > 1.0

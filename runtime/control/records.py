@@ -89,6 +89,8 @@ class Clamp(IntFlag):
     """A motor's reading is older than a tick: its last one stands in."""
     EXTRAPOLATED = 262144
     """No new believable sample of the IMU: the last one carried on by its own rate of turn."""
+    STOPPING = 524288
+    """The robot is on its way to standing: at rest instead of what was asked."""
 
 
 ESTIMATE_FIELDS: Fields = [

@@ -11,6 +11,7 @@ import numpy as np
 
 from drivers.robot import JointCommand, Measurement, motor_torque
 from faults.rig import Rig
+from runtime import modes
 from runtime.config import Config
 from runtime.messages import Mode
 
@@ -40,7 +41,7 @@ class Outcome(msgspec.Struct, kw_only=True):
     noticed: int | None = None
     """Tick in which the daemon first said that something was wrong."""
     answered: int | None = None
-    """Tick in which it left its mode: damped, sat down, or stopped its walk."""
+    """Tick in which it left its mode, damped or sat down, or began to stop its walk."""
     torque: float = 0.0
     """Largest that a motor exerted after the fault, N·m."""
     speed: float = 0.0
@@ -100,7 +101,8 @@ class Watch:
             outcome.evidence = self.ticks
         if outcome.noticed is None and (rig.cycle.health or rig.cycle.state.fault):
             outcome.noticed = self.ticks
-        if outcome.answered is None and rig.mode is not self._mode:
+        stopping = rig.cycle.state.fault or modes.stopping(rig.cycle.state)
+        if outcome.answered is None and (stopping or rig.mode is not self._mode):
             outcome.answered = self.ticks
         if rig.cycle.events and not outcome.words:
             said = [event.text for event in rig.cycle.events if event.kind == "fault"]
