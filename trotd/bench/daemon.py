@@ -190,3 +190,8 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def may_fifo() -> bool:
+    """Whether this user may run under SCHED_FIFO."""
+    return subprocess.run(["chrt", "-f", str(PRIORITY), "true"], capture_output=True, check=False).returncode == 0

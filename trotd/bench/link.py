@@ -1,7 +1,7 @@
 """What the link adds: from a client's command to the tick that uses it, the e-stop, publishing, and who looks on.
 
 The clients are processes of their own, as a joystick, a viewer and a monitor are; times are of the one monotonic clock
-that all processes of a machine share.
+that all processes of a machine share. The daemon runs under SCHED_FIFO where that is permitted, as the service does.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from runtime.policies import find_policy, load
 from runtime.shelf import PolicyFile
 from runtime.status import build_status
 from station.session import Station
-from trotd.bench.daemon import ROBOT, Walking, free_endpoint, set_off, walking_daemon
+from trotd.bench.daemon import ROBOT, Walking, free_endpoint, may_fifo, set_off, walking_daemon
 from trotd.bench.report import Figure, Finding, shown
 
 RATE = 200.0
@@ -65,7 +65,7 @@ def command_to_applied(commands: int, stops: int) -> Iterator[Finding]:
     bare: list[float] = []
     stopped: list[float] = []
     jitter = random.Random(1)
-    with walking_daemon(RATE, False, commands // 20 + 5 * stops, steered=False, extra=QUICK_POSTURE) as walking:
+    with walking_daemon(RATE, may_fifo(), commands // 20 + 5 * stops, steered=False, extra=QUICK_POSTURE) as walking:
         station = walking.station
         publisher = station.session.declare_publisher(station.keys.velocity, express=True)
         with _bare_put() as put:
@@ -201,7 +201,7 @@ def looked_on(rounds: int) -> Iterator[Finding]:
     """
     stretches: dict[str, list[float]] = {"off": [], "on": [], "stuck": []}
     grown: list[float] = []
-    with walking_daemon(RATE, False, round(rounds * (6 * TURN + COME))) as walking:
+    with walking_daemon(RATE, may_fifo(), round(rounds * (6 * TURN + COME))) as walking:
         for number in shown(range(2 * rounds), "viewer and monitor on or off", 2 * rounds):
             if number % 2:
                 stretches["off"].append(_stretch())

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from trotd.bench.daemon import PRIORITY, Disturbed, Slice, walking_daemon
+from trotd.bench.daemon import PRIORITY, Disturbed, Slice, may_fifo, walking_daemon
 from trotd.bench.report import Figure, Finding, Missing, shown
 
 RATES = (200.0, 500.0, 1000.0)
@@ -31,7 +31,7 @@ def measure(quick: bool) -> Iterator[Finding]:
         yield Missing("timer", "beside cyclictest", "not installed: apt install rt-tests")
     rates = (1000.0,) if quick else RATES
     for fifo in (False, True):
-        if fifo and not _may_fifo():
+        if fifo and not may_fifo():
             yield Missing("timer", "SCHED_FIFO", "not permitted: run as root, or raise RLIMIT_RTPRIO")
             return
         for rate in rates:
@@ -135,7 +135,3 @@ def run_cyclictest(rate: float, fifo: bool, seconds: int) -> np.ndarray:
     answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     rows = re.findall(r"^(\d{6}) (\d+)$", answer, re.MULTILINE)
     return np.repeat([float(row[0]) for row in rows], [int(row[1]) for row in rows])
-
-
-def _may_fifo() -> bool:
-    return subprocess.run(["chrt", "-f", str(PRIORITY), "true"], capture_output=True, check=False).returncode == 0
