@@ -70,7 +70,7 @@ TABLE: tuple[Fault, ...] = (
         None,
         "derating.derate_joint",
         "1",
-        f"{DEGRADE}::test_torque_is_taken_back_as_the_rms_nears_the_rating",
+        "tests/test_derating.py::test_torque_is_taken_back_as_the_rms_nears_the_rating",
         "its torque bound falls (`CURRENT`)",
     ),
     Fault(

@@ -7,16 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_limits import CONFIG, healthy, make_guard
 from walks import Walk
 
 from drivers.robot import Measurement
 from runtime.control.records import Clamp, VelocityCommand
 from runtime.cycle import Cycle
-from runtime.guard import Guard
 from runtime.messages import Mode, Request
 from runtime.modes import Reason
-from runtime.parameters import DegradeConfig, LimitsConfig
 from sim.scenario import Scenario
 
 Change = Callable[[Measurement, int], Measurement]
@@ -141,31 +138,6 @@ def test_warm_motors_slow_the_walk_and_bound_its_torque(walk: Walk) -> None:
     assert walk.cycle.guard.torque_share == pytest.approx(0.8)
     assert walk.cycle.tick["velocity_command"][0, 0] < 0.75
     assert abs(walk.world.truth.linear_velocity[0] - 0.6) < 0.15
-
-
-def test_a_supply_that_sags_slows_the_walk() -> None:
-    guard = Guard(CONFIG.robot, LimitsConfig(min_voltage=20.0), 200.0, DegradeConfig(voltage_start=24.0))
-    for volts, share in ((25.0, 1.0), (22.0, 0.75), (20.0, 0.5)):
-        tick = healthy()
-        tick["voltage"] = volts
-        guard.judge(tick)
-        assert guard.speed_share == pytest.approx(share)
-
-
-def test_torque_is_taken_back_as_the_rms_nears_the_rating() -> None:
-    guard, tick = make_guard(), healthy()
-    shares = []
-    for rms in (10.0, 15.0, 16.5, 18.0):
-        guard.memory["mean_square"] = rms**2
-        tick["joint_torque"] = rms
-        guard.judge(tick)
-        shares.append(guard.torque_share)
-    assert shares[:2] == [1.0, 1.0] and shares[1] > shares[2] > shares[3]
-    assert shares[3] == pytest.approx(0.9 * 18.0 / 40.0, abs=0.01)
-    tick["command_torque"] = 30.0
-    guard.bound(tick)
-    assert guard.marks & Clamp.CURRENT and not guard.marks & (Clamp.TORQUE | Clamp.THERMAL)
-    assert tick["command_torque"].max() == pytest.approx(40.0 * shares[3])
 
 
 def test_a_robot_that_gives_up_while_standing_sinks_instead_of_dropping(walk: Walk) -> None:

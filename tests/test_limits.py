@@ -175,9 +175,10 @@ def test_a_command_that_is_not_finite_is_refused(name: str, value: float) -> Non
         assert make_guard().bound(tick) is Reason.BAD_COMMAND
 
 
-def test_a_negative_gain_is_refused() -> None:
+@pytest.mark.parametrize("name", ["command_kp", "command_kd"])
+def test_a_negative_gain_is_refused(name: str) -> None:
     tick = healthy()
-    tick["command_kp"][0, 1, 1] = -1.0
+    tick[name][0, 1, 1] = -1.0
     assert make_guard().bound(tick) is Reason.BAD_COMMAND
 
 
