@@ -13,9 +13,9 @@ fail() { echo "test-arm64: FAILED: $*" >&2; exit 1; }
 say() { echo "test-arm64: $(date +%H:%M:%S) $*"; }
 
 # Arithmetic and wire formats: what must come out the same on another processor. Compiling is slow under emulation, so
-# whole walks are left to the machines that run them natively.
-tests=(test_kinematics test_contact test_gait test_trajectory test_torque test_policy test_observation test_estimator
-    test_grf test_moteus test_mit test_xbus test_messages test_config test_ring test_durable test_recorder)
+# the estimator, the controller and whole walks are left to machines that run them natively; quick ones come first.
+tests=(test_moteus test_mit test_xbus test_ring test_durable test_messages test_config test_recorder
+    test_kinematics test_contact test_gait test_trajectory test_torque test_policy test_observation test_grf)
 [ -z "${TROTD_ARM64_TESTS:-}" ] || read -ra tests <<<"$TROTD_ARM64_TESTS"
 
 [ "$(id -u)" = 0 ] || skip "not root"
