@@ -26,6 +26,8 @@ TWIN_MAX_AGE = 1.0
 nothing grows old in it meanwhile."""
 STALL_STAND, STALL_DAMP = 0.25, 1.0
 """The guard's bounds on a late loop for bodies that wait for it, s."""
+MISSED = 0.9
+"""Share of missed ticks with which such a body may still be armed."""
 
 
 class BodyError(ValueError):
@@ -55,7 +57,12 @@ def lenient(kind: str, config: Config) -> Config:
     )
     if kind == "null":  # it is at once where it was told to be, without any speed
         limits = msgspec.structs.replace(limits, max_position_jump=3.0, max_position_noise=3.0)
-    return msgspec.structs.replace(config, limits=limits)
+    arming = msgspec.structs.replace(
+        config.arming,
+        max_missed=max(config.arming.max_missed, MISSED),
+        max_lateness=max(config.arming.max_lateness, STALL_DAMP),
+    )
+    return msgspec.structs.replace(config, limits=limits, arming=arming)
 
 
 def build_body(kind: str, config: Config, robot_file: Path, folder: Path, observe: bool = False) -> Body:
