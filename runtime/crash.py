@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from drivers.description import UNDECODABLE
 from drivers.durable import write_whole
 from runtime.messages import Event
 from runtime.recorder import CHUNK, KEYFRAMES
@@ -77,7 +78,7 @@ def salvage(left: Path, recordings: Path, max_files: int, max_bytes: int) -> tup
     """
     try:
         header, ended, ticks = _read(left)
-    except (ValueError, OverflowError, msgspec.MsgspecError) as error:
+    except (ValueError, OverflowError, *UNDECODABLE) as error:
         shutil.rmtree(left)
         raise CrashError(f"{left}: {error}") from error
     places = ticks.whole()

@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from drivers.description import Record
+from drivers.description import UNDECODABLE, Record
 from runtime.control.parameters import GaitName
 from station.session import StationError
 
@@ -208,7 +208,7 @@ def load_mapping(path: Path) -> PadMapping:
         return msgspec.convert(tomllib.loads(path.read_text()), PadMapping)
     except OSError as error:
         raise StationError(f"{path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+    except (tomllib.TOMLDecodeError, *UNDECODABLE) as error:
         raise StationError(f"{path}: {error}") from error
 
 

@@ -24,12 +24,15 @@ from drivers.motors import Motors
 from drivers.mtdata2 import Data, SampleDecoder
 from drivers.survey import MitQuestion, MoteusQuestion, Question
 from drivers.xbus import Message, XbusParser
-from runtime import config, messages, policies, recording
+from runtime import config, crash, messages, policies, recording
 from runtime.config import ConfigError
+from runtime.keyframe import KEYFRAME_DTYPE
 from runtime.messages import TICK_DTYPE, MessageError
 from runtime.policies import PolicyError
-from runtime.recorder import Recorder
+from runtime.recorder import EVENT_DTYPE, Recorder
 from runtime.recording import Header, RecordingError
+from runtime.ring import Kind, create
+from station import pad as station_pad
 from station.session import StationError
 from station.ticks import read_schema
 from trotd.commission.steps import Commission
@@ -258,12 +261,9 @@ def calibration_door(folder: Path) -> Door:
     return file_door(folder / "calibration.json", load, CalibrationError, [seed])
 
 
-@door("recording")
-def recording_door(folder: Path) -> Door:
-    kept = Recorder(folder, 200.0, 1.0, 10, 10**9)
-    for _ in range(3):
-        kept.keep(np.zeros(1, TICK_DTYPE))
-    header = Header(
+def header() -> Header:
+    """Of a recording that says little."""
+    return Header(
         robot="stoch3",
         robot_toml="",
         policy="",
@@ -275,8 +275,52 @@ def recording_door(folder: Path) -> Door:
         itemsize=TICK_DTYPE.itemsize,
         events=[],
     )
-    seed = kept.write(header, "good").read_bytes()
+
+
+@door("recording")
+def recording_door(folder: Path) -> Door:
+    kept = Recorder(folder, 200.0, 1.0, 10, 10**9)
+    for _ in range(3):
+        kept.keep(np.zeros(1, TICK_DTYPE))
+    seed = kept.write(header(), "good").read_bytes()
     return file_door(folder / "mutated.trotd", recording.load, RecordingError, [seed])
+
+
+@door("crash")
+def crash_door(folder: Path) -> Door:
+    """What a killed run left in memory: ``h`` and another header beside a good ring, or ``r`` and another ring."""
+    left, shelf = folder / "left", folder / "shelf"
+    kinds = [Kind(TICK_DTYPE, 4), Kind(KEYFRAME_DTYPE, 2), Kind(EVENT_DTYPE, 2)]
+    ticks, *_ = create(kinds, folder / "good-ring")
+    for index in range(3):
+        tick = np.zeros(1, TICK_DTYPE)
+        tick["index"] = index
+        ticks.put(tick)
+    crash.keep_header(folder, header())
+    good = (folder / crash.HEADER).read_bytes(), (folder / "good-ring").read_bytes()
+
+    def put(head: bytes, ring: bytes) -> object:
+        left.mkdir(exist_ok=True)
+        (left / crash.HEADER).write_bytes(head)
+        (left / crash.RING).write_bytes(ring)
+        return crash.salvage(left, shelf, 3, 10**6)
+
+    def take(data: bytes) -> None:
+        put(data[1:] if data[:1] == b"h" else good[0], good[1] if data[:1] == b"h" else data[1:])
+
+    def recover() -> None:
+        if next(turn) % 50 == 0:
+            put(*good)
+
+    turn = iter(range(10**12))
+    return Door(take, (crash.CrashError,), [b"h" + good[0], b"r" + good[1]], recover, share=0.1, text=True)
+
+
+@door("pad")
+def pad_door(folder: Path) -> Door:
+    """How a gamepad's keys are laid out."""
+    shipped = [path.read_bytes() for path in sorted(Path(station_pad.__file__).parent.rglob("*.toml"))]
+    return file_door(folder / "pad.toml", station_pad.load_mapping, StationError, shipped)
 
 
 @door("progress")

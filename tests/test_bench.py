@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from runtime import config
 from runtime.messages import TICK_DTYPE, Mode
-from trotd.bench import command, link, qp, report, senses, tick
+from trotd.bench import codecs, command, link, qp, report, senses, tick
 from trotd.bench.corpus import KINDS, Corpus
 from trotd.bench.exact import constraints, exact_forces, is_minimum
 
@@ -131,3 +132,22 @@ def test_the_senses_on_a_noisy_twin_hold_their_bounds() -> None:
     found = [finding for finding in senses.measure(quick=True) if isinstance(finding, report.Figure)]
     assert len(found) == 6
     assert [figure.name for figure in found if figure.met is False] == []
+
+
+def test_codecs_do_the_same_work_on_both_sides_and_meet_nobody_asleep() -> None:
+    loaded = config.load(config.find_robot("stoch3"))
+    found = {f.name: f for f in (*codecs.against_moteus(loaded, 3), *codecs.against_plain_walk(3))}
+    found |= {f.name: f for f in codecs.exchange(loaded, 20)}
+    assert all(isinstance(f, report.Figure) and np.isfinite(f.value) for f in found.values())
+    assert [f.bound for f in found.values() if f.bound is not None] == [0.1, 0.5, 150.0]
+    assert found["left for wires and control at 200 Hz"].value < 5.0
+    frame = codecs.measurement(7)
+    assert len(frame) == 73
+    damaged = b"noise" + frame[:20] + bytes([frame[20] ^ 1]) + frame[21:] + frame
+    assert codecs.plain_walk(frame) == codecs.plain_walk(damaged)
+
+
+def test_the_replies_that_are_decoded_are_the_makers_too() -> None:
+    moteus = pytest.importorskip("moteus")
+    said = moteus.parse_registers(codecs._reply(0.125, -0.5, 3.25)).response
+    assert [said[register] for register in (0, 1, 2, 3)] == pytest.approx([10, 0.125, -0.5, 3.25])

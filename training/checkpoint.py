@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 import msgspec
 import numpy as np
 
+from drivers.description import UNDECODABLE
 from training import pgpe
 from training.plan import RunPlan
 
@@ -83,7 +84,7 @@ class RunFolder:
             plan = msgspec.json.decode(file.read_bytes(), type=RunPlan)
         except FileNotFoundError as error:
             raise RunError(f"{self.path}: no run here (no run.json)") from error
-        except msgspec.MsgspecError as error:
+        except UNDECODABLE as error:
             raise RunError(f"{file}: {error}") from error
         if plan.config != config_hash:
             raise RunError(
