@@ -20,7 +20,7 @@ ALL_IDS = range(1, 127)
 SURVEY_TIME = 0.02
 """s that a group of motors may take to answer."""
 _GROUP = 8
-_TRIES = 2
+_TRIES = 3
 _MOTEUS_QUESTION = pad(bytes.fromhex("11001f01130d") + b"\x19" + encode_varuint(Register.FIRMWARE_VERSION))
 _MIT_HOST = 0
 

@@ -92,7 +92,10 @@ def test_a_scrambled_robot_is_understood_over_its_wires_even_if_interrupted(tmp_
         assert once_more.returncode == 0, once_more.stderr
         assert once_more.stdout.count("IMU: hold") == 3
         assert_true(shell.found(), shell.truth(7))
-        code, rows = shell.check()
+        for _ in range(5):
+            _, rows = shell.check()
+            if rows["IMU"] == "ok":  # a busy computer may keep its bytes for longer than is waited for the first ones
+                break
         assert rows["calibration"] == "ok"
         assert {verdict for what, verdict in rows.items() if " (id " in what} == {"ok"}
         assert rows["joints"] == rows["IMU"] == rows["gravity"] == "ok"
