@@ -27,6 +27,11 @@ class MitEmulator:
         self._drive = LIMP
         self._commanded_at = 0.0
 
+    @property
+    def energised(self) -> bool:
+        """See ``ServoEmulator.energised``."""
+        return self.enabled
+
     def answer(self, identifier: int, data: bytes, now: float) -> tuple[int, bytes] | None:
         """See ``ServoEmulator.answer``."""
         if self.silent or identifier != self.id or len(data) != 8:

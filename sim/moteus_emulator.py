@@ -71,6 +71,11 @@ class MoteusEmulator:
         self._commanded_at = self._energised_at = self._now = self._stepped = 0.0
         self._planned = math.nan
 
+    @property
+    def energised(self) -> bool:
+        """See ``ServoEmulator.energised``."""
+        return self.mode not in (Mode.STOPPED, Mode.FAULT)
+
     def restart(self, shift: float = 0.0) -> None:
         """Knob: the supply breaks down for a moment; it comes back stopped, its count off by ``shift`` rev."""
         self.mode, self.fault, self._command = Mode.STOPPED, 0, {}

@@ -28,6 +28,11 @@ class ServoEmulator(Protocol):
 
     id: int
 
+    @property
+    def energised(self) -> bool:
+        """Whether it drives its shaft, or brakes it."""
+        ...
+
     def answer(self, identifier: int, data: bytes, now: float) -> tuple[int, bytes] | None:
         """Obey one frame; the reply's arbitration id and data, or None where it gives none."""
 

@@ -150,15 +150,16 @@ class WireTwin:
     async def run(self, tick: float, patience: float, after_step: Callable[[], None] = lambda: None) -> None:
         """Live until cancelled: one ``tick``, s, for each round of frames to all servos, or by the clock without any.
 
-        A round that fails to come stops the world for ``patience``, s: so long a computer that is too slow slows the
-        twin's time, as it slows that of ``SimRobot``, and does not fell it. After that the daemon counts as dead: the
-        world goes on by the clock, and the servos' watchdogs with it.
+        A round that fails to come to servos that are energised stops the world for ``patience``, s: so long a computer
+        that is too slow slows the twin's time, as it slows that of ``SimRobot``, and does not fell it. After that the
+        daemon counts as dead: the world goes on by the clock, and the servos' watchdogs with it.
         """
         ticked, steps, short = self.body.wire.ticked, max(1, round(tick / self.body.world.period)), _BY_CLOCK * tick
         driven = False
         while True:
             try:
-                async with asyncio.timeout(max(patience, short) if driven else short):
+                waits = driven and any(servo.energised for servo in self.body.servos)
+                async with asyncio.timeout(max(patience, short) if waits else short):
                     await ticked.wait()
             except TimeoutError:
                 await asyncio.sleep(0)  # after a stall of this process the frames wait unread: they come first
