@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from twin_walk import WireWalk
 
+from runtime import config
 from runtime.messages import Mode, Request
+from station.tour import Leg
+from trotd.tour import take_tour
 
 
 @pytest.fixture
@@ -146,3 +150,24 @@ def test_it_walks_with_an_imu_that_gives_no_orientation(tmp_path: Path) -> None:
         walk.run(1.0, WALKING)
         assert walk.mean_velocity(1.0, WALKING) == pytest.approx(WALKING, abs=0.12)
         assert walk.faults == []
+
+
+def test_daemon_and_twin_as_processes_walk_in_real_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What ``make run-wire`` does, over a shorter way."""
+    legs = [
+        Leg("forward", (0.4, 0.0, 0.0), 3.0),
+        Leg("turn", (0.0, 0.0, 0.6), 3.0),
+        Leg("push", (0.0, 0.0, 0.0), 3.0, 0.5),
+    ]
+    monkeypatch.setattr("station.tour.plan_tour", lambda _config: legs)
+    path = config.find_robot("stoch3")
+    loaded = config.load(path)
+    arguments = ["--robot", str(path), "--rate-hz", str(loaded.control.rate_hz), "--state", str(tmp_path)]
+    take_tour(loaded, arguments, as_json=True, wire=True)
+    report = msgspec.json.decode(capsys.readouterr().out)
+    assert report["problems"] == []
+    assert [leg["falls"] for leg in report["legs"]] == [0, 0, 0]
+    forward, turn, _ = (leg["measured"] for leg in report["legs"])
+    assert forward[0] > 0.2 and turn[2] > 0.3

@@ -55,6 +55,9 @@ def lenient(kind: str, config: Config) -> Config:
         stall_stand=max(limits.stall_stand, TWIN_MAX_AGE if kind == "twin" else STALL_STAND),
         stall_damp=max(limits.stall_damp, STALL_DAMP),
     )
+    arming = config.arming
+    if kind == "twin":  # it waits, so a loop that is late here and now says nothing about the next step
+        arming = msgspec.structs.replace(arming, max_missed=1.0, max_lateness=max(arming.max_lateness, TWIN_MAX_AGE))
     if kind == "null":  # it is at once where it was told to be, without any speed
         limits = msgspec.structs.replace(limits, max_position_jump=3.0, max_position_noise=3.0)
     arming = msgspec.structs.replace(
