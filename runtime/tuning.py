@@ -171,13 +171,13 @@ class Tuning:
             numbers[_SHARE] = share
 
     def entries(self) -> list[TuningEntry]:
-        """Every name with what is in force, what is wanted, and its bounds."""
+        """Every name with what is in force, what it moves to and its bounds; times are the gait's."""
         own = self._config.control.gait.name
         found = [TuningEntry("gait", "", self._gait, self._gait, own, None, None, self.saved.get("gait"))]
         now = self._numbers
         where = _places()
         for name, one in self.tunables.items():
-            value, wanted = float(now[where[name]]), self._wanted[name]
+            value, wanted = float(now[where[name]]), float(self._target[where[name]])
             found.append(TuningEntry(name, one.unit, value, wanted, one.own, one.low, one.high, self.saved.get(name)))
         return found
 
