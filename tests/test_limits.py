@@ -155,6 +155,15 @@ def test_the_law_with_the_bounded_command_stays_within_the_peak(
     assert bool(guard.marks & Clamp.TORQUE) == bool((np.abs(asked) > PEAK).any())
 
 
+def test_a_torque_beyond_the_peak_is_named_beside_a_lower_bound() -> None:
+    for torque, both in ((39.0, False), (41.0, True)):
+        guard, tick = make_guard(), healthy()
+        tick["joint_temperature"][0, 0, 0] = 79.0
+        tick["command_torque"][0, 0, 0] = torque
+        assert guard.judge(tick) is Reason.OK and guard.bound(tick) is Reason.OK
+        assert guard.marks & Clamp.THERMAL and bool(guard.marks & Clamp.TORQUE) == both
+
+
 def _law(tick: Records) -> np.ndarray:
     t = tick[0]
     fields = ("position", "velocity", "kp", "kd", "torque")
