@@ -218,7 +218,6 @@ def test_a_router_that_goes_away_stops_the_walk_and_not_the_daemon(tmp_path: Pat
 
 def test_a_joystick_that_is_killed_stops_the_walk(tmp_path: Path) -> None:
     async def act(served: Served) -> None:
-        await served.walk()
         code = (
             "import sys, time; from station.session import connected\n"
             "with connected(sys.argv[1], sys.argv[2]) as s:\n"
@@ -231,7 +230,8 @@ def test_a_joystick_that_is_killed_stops_the_walk(tmp_path: Path) -> None:
             [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE
         ) as pad:
             assert pad.stdout is not None
-            await asyncio.to_thread(pad.stdout.readline)
+            await asyncio.to_thread(pad.stdout.readline)  # it speaks: a walk without a word would end by itself
+            await served.walk()
             async with asyncio.timeout(20):
                 while not served.daemon.cycle.tick["asked_velocity"][0, 0]:  # noqa: ASYNC110
                     await asyncio.sleep(0.01)

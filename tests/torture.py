@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 from faults.matrix import BY_NAME, ROWS
-from faults.report import print_json, print_outcome, print_table, shown, worst
+from faults.report import print_json, print_outcome, print_table, shown, told, worst
 from faults.run import BASES, BODIES, GAITS, Case, replay, run_trunk, trunks
 from faults.workers import spread
 
@@ -75,10 +75,13 @@ def main(
     else:
         cases = plan(row or list(BY_NAME), seeds, first, bodies) if sample is None else pick(sample)
         order = {(case.body, case.gait, case.row, case.seed): place for place, case in enumerate(cases)}
-        outcomes = sorted(
-            shown(spread(trunks(cases), run_trunk, jobs), "faults", len(cases)),
-            key=lambda o: order[o.body, o.gait, o.row, o.seed],
-        )
+        outcomes = []
+        try:
+            for outcome in told(shown(spread(trunks(cases), run_trunk, jobs), "faults", len(cases))):
+                outcomes.append(outcome)
+        except KeyboardInterrupt:
+            typer.echo(f"broken off after {len(outcomes)} of {len(cases)} faults", err=True)
+        outcomes.sort(key=lambda o: order[o.body, o.gait, o.row, o.seed])
         (print_json if json else print_table)(outcomes)
     if keep is not None:
         keep.write_bytes(worst(outcomes))

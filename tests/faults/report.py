@@ -39,6 +39,19 @@ def shown(outcomes: Iterable[Result], words: str, total: int) -> Iterator[Result
             yield outcome
 
 
+def told(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
+    """``outcomes``, each violation said at once: a run that is broken off has told what it found."""
+    for outcome in outcomes:
+        if outcome.violations:
+            sys.stderr.write(f"{describe(outcome)}\n")
+        yield outcome
+
+
+def describe(outcome: Outcome) -> str:
+    """A violation in one line, with the command that shows it again."""
+    return f"{'; '.join(outcome.violations)} [{outcome.fault}]: {command(outcome)}"
+
+
 def command(outcome: Outcome) -> str:
     """What shows one fault again."""
     place = f"--body {outcome.body} --gait {outcome.gait} --row {outcome.row} --seed {outcome.seed}"
@@ -100,7 +113,7 @@ def print_table(outcomes: Sequence[Outcome]) -> None:
     )
     failed = [outcome for outcome in outcomes if outcome.violations]
     for outcome in failed[:SHOWN]:
-        console.print(f"{'; '.join(outcome.violations)} [{outcome.fault}]: {command(outcome)}", markup=False)
+        console.print(describe(outcome), markup=False)
     console.print(f"{len(outcomes)} faults, {len(failed)} with violations", style="bold")
 
 
