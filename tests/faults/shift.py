@@ -181,10 +181,11 @@ def _daemon_command(robot: str, endpoint: str, folder: Path) -> list[str]:
 def _stand_and_walk(station: Station) -> None:
     time.sleep(1.5)  # it lies down first
     for wish, mode in ((Request.ARM, Mode.DAMP), (Request.STAND, Mode.STAND), (Request.WALK, Mode.WALK)):
-        reply = station.ask_for(ModeReply, station.keys.mode, wish.value.encode())
-        if not reply.accepted:
-            raise StationError(f"{wish.value}: {reply.reason}")
         end = time.monotonic() + 60.0
+        while not (reply := station.ask_for(ModeReply, station.keys.mode, wish.value.encode())).accepted:
+            if time.monotonic() > end:
+                raise StationError(f"{wish.value}: {reply.reason}")
+            time.sleep(0.2)  # a busy machine is not punctual at once
         while station.next_status(10.0).mode != mode.name:
             if time.monotonic() > end:
                 raise StationError(f"the robot did not come into {mode.name}")
