@@ -83,9 +83,9 @@ class Hands:
 
     @property
     def sticks(self) -> Sticks:
-        """Centred for a moment, as after every start, then slowly to and fro."""
+        """Centred for a moment twice a minute, as after every start and loss, else slowly to and fro."""
         t = time.monotonic() - self._start
-        if t < 1.0:
+        if t % 30.0 < 3.0:
             return Sticks(held=True)
         return Sticks(0.3 + 0.3 * math.sin(0.21 * t), 0.3 * math.sin(0.37 * t), 0.4 * math.sin(0.13 * t), True)
 
