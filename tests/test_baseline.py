@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from daemons import Probe, Served, make_config
 from scenes import Workbench
-from twin_walk import TwinWalk
+from twin_walk import QUICK
 
 from drivers import calibration
 from drivers.calibration import CalibrationError
@@ -25,6 +25,7 @@ from sim.build import lab_build
 from sim.scenario import Noise, Scenario
 from trotd.bodies import build_body
 from trotd.commission.baseline import find_baseline, listen
+from trotd.lockstep import TwinWalk
 from trotd.twin import true_calibration
 from trotd.wire import calibration_file, own_wires, with_baseline
 
@@ -34,7 +35,7 @@ STOCH3 = config.load(config.find_robot("stoch3"))
 def test_a_standing_robot_tells_what_its_legs_feign() -> None:
     """Torque sensors that are wrong by newton metres: taken off, the forces carry the weight where it is."""
     pose = Posture(STOCH3.robot, STOCH3.control, STOCH3.posture).folded_joints
-    walk = TwinWalk(quick=True, scenario=Scenario(noise=Noise(joint_torque_bias=1.0), joint_position=pose, seed=4))
+    walk = TwinWalk(QUICK, Scenario(noise=Noise(joint_torque_bias=1.0), joint_position=pose, seed=4))
     walk.stand()
     walk.run(1.0)
     ticks, truth = [], []
