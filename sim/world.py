@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.description import RobotDescription
-from drivers.robot import JOINTS, LEGS, Array, JointCommand, Measurement
+from drivers.robot import JOINTS, LEGS, Array, JointCommand, Measurement, damp_command
 from sim.errors import PhysicsError, SimulatorMissing
 from sim.model import PAYLOAD, Model, build_model, standing_pose
 from sim.motors import Motors
@@ -84,6 +84,8 @@ class World:
                 self._client = self._bullet.connect(self._bullet.DIRECT)
                 self._start(Scenario())
             self._check_inertia()
+            self.reset(Scenario())
+            self.step(damp_command(0.0))  # compiles here what would otherwise compile in somebody's first tick
             self.reset(Scenario())
         except BaseException:
             self.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -23,6 +24,7 @@ from runtime.recording import list_recordings, load
 from runtime.replay import Player
 from sim.build import lab_build
 from sim.scenario import Noise, Scenario
+from station.session import Station
 from trotd.bodies import build_body
 from trotd.commission.baseline import find_baseline, listen
 from trotd.lockstep import TwinWalk
@@ -76,7 +78,13 @@ def test_it_listens_only_to_a_robot_that_stands(tmp_path: Path) -> None:
             with pytest.raises(CommissionError, match="is DAMP, not in STAND: trotd arm, trotd stand"):
                 await served.client(lambda station: listen(station, 0.2))
             await served.stand()
-            ticks = await served.client(lambda station: listen(station, 0.5))
+
+            def heard(station: Station) -> Any:
+                while station.next_status().mode != "STAND":
+                    pass
+                return listen(station, 0.5)
+
+            ticks = await served.client(heard)
             assert len(ticks) > 10
 
     asyncio.run(live())

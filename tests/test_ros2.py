@@ -247,6 +247,8 @@ def test_a_twist_steers_a_robot_that_walks_and_no_other(kind: str, tmp_path: Pat
                 peer.steer(kind, 0.3)
                 await until(lambda: bridge.steering.counts["taken"] == 1)
                 assert served.daemon.cycle.state.mode is Mode.DAMP
+                peer.steer(kind, 0.0)  # arming wants the sticks centred
+                await until(lambda: bridge.steering.counts["taken"] == 2)
                 await served.walk()
                 peer.steer(kind, 0.3)
                 await until(lambda: row["asked_velocity"][0].tolist() == [0.3, 0.0, 0.0])
@@ -291,8 +293,12 @@ def test_what_cannot_be_a_wish_of_now_is_counted_and_moves_nothing(tmp_path: Pat
 def test_an_observer_declares_no_subscription(tmp_path: Path) -> None:
     async def main() -> None:
         async with Served(make_config(), tmp_path) as served:
-            with router() as (session, endpoint), bridged(served, endpoint, observe=True, namespace="/a"):
-                tokens = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/5/**")]
+            with router() as (session, endpoint), bridged(served, endpoint, observe=True, namespace="/a") as bridge:
+                await until(lambda: bridge.published > 0)  # by then everything is declared
+                tokens: list[str] = []
+                end = time.monotonic() + 20.0
+                while len(tokens) < 5 and time.monotonic() < end:
+                    tokens = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/5/**")]
             assert len(tokens) == 5 and not any("/MS/" in token for token in tokens)
             assert any("/%a%joint_states/" in token for token in tokens)
 
@@ -314,7 +320,10 @@ def test_cmd_vel_moves_the_simulated_robot(tmp_path: Path) -> None:
             peer = Peer(session)
             odometry = topic("/odom", "nav_msgs/msg/Odometry").key(5)
             for wish, mode in ((Request.ARM, "DAMP"), (Request.STAND, "STAND"), (Request.WALK, "WALK")):
-                assert station.ask_for(ModeReply, station.keys.mode, wish.value.encode()).accepted
+                end = time.monotonic() + 30.0
+                while not (reply := station.ask_for(ModeReply, station.keys.mode, wish.value.encode())).accepted:
+                    assert wish is Request.ARM and time.monotonic() < end, reply.reason
+                    time.sleep(0.1)  # the arming list wants to have seen the loop run
                 while station.next_status().mode != mode:
                     pass
             end = time.monotonic() + 60.0
