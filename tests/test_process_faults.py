@@ -219,19 +219,24 @@ def test_a_router_that_goes_away_stops_the_walk_and_not_the_daemon(tmp_path: Pat
 def test_a_joystick_that_is_killed_stops_the_walk(tmp_path: Path) -> None:
     async def act(served: Served) -> None:
         code = (
-            "import sys, time; from station.session import connected\n"
+            "import select, sys, time; from station.session import connected\n"
             "with connected(sys.argv[1], sys.argv[2]) as s:\n"
             "    t = s.session.liveliness().declare_token(s.keys.operator + '/me')\n"
+            "    told = False\n"
             "    while True:\n"
-            "        s.session.put(s.keys.velocity, sys.argv[3].encode()); print('x', flush=True); time.sleep(0.02)"
+            "        told = told or bool(select.select([sys.stdin], [], [], 0)[0])\n"
+            "        s.session.put(s.keys.velocity, sys.argv[3 + told].encode())\n"
+            "        print('x', flush=True); time.sleep(0.02)"
         )
-        arguments = [served.config.robot.name, served.config.link.listen[0], FORWARD.decode()]
+        arguments = [served.config.robot.name, served.config.link.listen[0], CENTRED, FORWARD.decode()]
         with subprocess.Popen(  # noqa: ASYNC220
-            [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE
+            [sys.executable, "-c", code, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         ) as pad:
-            assert pad.stdout is not None
+            assert pad.stdout is not None and pad.stdin is not None
             await asyncio.to_thread(pad.stdout.readline)  # it speaks: a walk without a word would end by itself
             await served.walk()
+            pad.stdin.write(b"forward\n")
+            pad.stdin.flush()
             async with asyncio.timeout(20):
                 while not served.daemon.cycle.tick["asked_velocity"][0, 0]:  # noqa: ASYNC110
                     await asyncio.sleep(0.01)
@@ -328,6 +333,10 @@ def robot_file(folder: Path) -> Path:
     path = folder / "stoch3.toml"
     path.write_text(f"{text}\n[posture]\n{posture}\n")
     return path
+
+
+CENTRED = '{"linear": [0.0, 0.0], "yaw_rate": 0.0}'
+"""What a pad says before it may arm."""
 
 
 def walk(station: Station) -> None:
