@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import platform
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -207,10 +207,8 @@ class World:
     def foot_contacts(self) -> NDArray[np.bool_]:
         """Feet that touched the ground in the last physics step: a part of ``truth`` that costs less. Shape (4,)."""
         touched = [False] * 4
-        for contact in self._bullet.getContactPoints(self._robot, physicsClientId=self._client):
-            leg = self._foot_of_link.get(contact[3])
-            if leg is not None and contact[9] > 0.0:
-                touched[leg] = True
+        for leg, _ in self._foot_points():
+            touched[leg] = True
         return np.array(touched)
 
     @property
@@ -280,12 +278,16 @@ class World:
         rotation = from_xyzw(orientation) @ self._principal.T
         return np.array(position) - rotation @ self._com, rotation
 
-    def _foot_forces(self) -> tuple[NDArray[np.bool_], Array]:
-        contacts, forces = [False] * 4, [[0.0, 0.0, 0.0] for _ in range(4)]
+    def _foot_points(self) -> Iterator[tuple[int, Any]]:
+        """The engine's contact points that press on a foot, with its leg."""
         for contact in self._bullet.getContactPoints(self._robot, physicsClientId=self._client):
             leg = self._foot_of_link.get(contact[3])
-            if leg is None or contact[9] <= 0.0:
-                continue
+            if leg is not None and contact[9] > 0.0:
+                yield leg, contact
+
+    def _foot_forces(self) -> tuple[NDArray[np.bool_], Array]:
+        contacts, forces = [False] * 4, [[0.0, 0.0, 0.0] for _ in range(4)]
+        for leg, contact in self._foot_points():
             contacts[leg] = True
             force = forces[leg]
             for axis in range(3):

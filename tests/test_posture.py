@@ -133,7 +133,11 @@ def test_every_shipped_robot_can_fold_and_stand(path: object) -> None:
     config = load(path)  # type: ignore[arg-type]
     posture = Posture(config.robot, config.control, config.posture)
     posture.stand_up(measured(posture.folded_joints))
-    play(posture)
+    last = play(posture)[-1]
+    lower, upper = np.array(config.robot.joints.lower), np.array(config.robot.joints.upper)
+    assert ((lower <= last.position) & (last.position <= upper)).all()
+    assert (last.kp > 0.0).all() and np.isfinite(last.torque).all()
+    assert not np.allclose(last.position, posture.folded_joints)
 
 
 def test_a_fold_that_the_joints_do_not_reach_is_refused() -> None:

@@ -6,11 +6,15 @@ import pickle
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.robot import Measurement
 from runtime.config import ROBOTS, load
+from sim import sensing
 from sim.rotation import from_rpy, from_xyzw, to_quaternion
 from sim.scenario import Noise, Push, Scenario
+from sim.sensing import BODY, GRAVITY, POSITION, RATE, RAW, READINGS, VELOCITY, read_body
 from sim.sensors import AMBIENT, RISE, WARMING_TIME, Sensors
 from sim.terrain import HeightField
 
@@ -129,3 +133,25 @@ def test_a_scenario_that_is_not_finite_is_refused_by_name(change: dict[str, obje
 def test_a_scenario_travels_to_a_worker_process() -> None:
     scenario = Scenario(terrain=HeightField(0.05, extent=4.0), pushes=(Push(0.1, 0.2, (1.0, 0.0, 0.0)),), seed=3)
     assert pickle.loads(pickle.dumps(scenario)) == scenario
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_compiled_readings_are_those_of_the_rotations_written_plainly(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn, principal = from_rpy(rng.uniform(-3.1, 3.1, 3)), from_rpy(rng.uniform(-3.1, 3.1, 3))
+    w, x, y, z = to_quaternion(turn)
+    raw, com, before = rng.normal(0.0, 2.0, RAW), rng.normal(0.0, 0.1, 3), rng.normal(0.0, 1.0, 3)
+    raw[39:43] = x, y, z, w
+    body, exact = np.zeros(BODY), np.zeros(READINGS)
+    read_body(raw, com, principal, before, 0.005, body, exact)
+    rotation = turn @ principal.T
+    velocity = raw[43:46] - np.cross(raw[46:49], rotation @ com)
+    np.testing.assert_allclose(body[sensing.ROTATION].reshape(3, 3), rotation, atol=1e-12)
+    np.testing.assert_allclose(body[POSITION], raw[36:39] - rotation @ com, atol=1e-12)
+    np.testing.assert_allclose(body[VELOCITY], velocity, atol=1e-12)
+    np.testing.assert_array_equal(body[RATE], raw[46:49])
+    quaternion = to_quaternion(rotation)
+    np.testing.assert_allclose(exact[36:40] * np.sign(exact[36:40] @ quaternion), quaternion, atol=1e-9)
+    np.testing.assert_allclose(exact[40:43], rotation.T @ raw[46:49], atol=1e-12)
+    felt = rotation.T @ ((velocity - before) / 0.005 + [0.0, 0.0, GRAVITY])
+    np.testing.assert_allclose(exact[43:46], felt, atol=1e-9)
