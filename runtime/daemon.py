@@ -202,7 +202,8 @@ class Daemon:
         fed = 0
         command = damp_command(self.config.damp.kd)
         realtime.settle_garbage()
-        with Ticker(self.config.control.rate_hz, self.config.realtime.early_wake) as ticker:
+        early = self.config.realtime.early_wake
+        with realtime.shared_interpreter(), Ticker(self.config.control.rate_hz, early) as ticker:
             while not stop.is_set():
                 index = await ticker.wait()
                 wake = Wake(index, ticker.stamp, ticker.elapsed, ticker.lateness, ticker.overruns)

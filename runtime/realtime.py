@@ -5,15 +5,19 @@ SCHED_FIFO and the affinity hold for the calling thread only; RESET_ON_FORK keep
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from runtime.parameters import RealtimeConfig
 
 MCL_CURRENT, MCL_FUTURE = 1, 2
+SWITCH = 0.0002
+"""s; Python's own is 5 ms, a whole tick: the writer of a recording would make the loop miss one."""
 
 
 class RealtimeError(RuntimeError):
@@ -75,6 +79,17 @@ def _try(wish: str, act: Callable[[], None]) -> Granted:
 def _mlockall() -> None:
     if ctypes.CDLL(None, use_errno=True).mlockall(MCL_CURRENT | MCL_FUTURE) < 0:
         raise OSError(ctypes.get_errno(), "mlockall")
+
+
+@contextlib.contextmanager
+def shared_interpreter() -> Iterator[None]:
+    """A thread that computes in Python holds the interpreter for ``SWITCH`` at most while another wants it."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 def settle_garbage() -> None:

@@ -12,9 +12,11 @@ import pytest
 
 from runtime import config
 from runtime.messages import TICK_DTYPE, Mode
-from trotd.bench import codecs, command, link, qp, report, senses, tick
+from trotd.bench import codecs, command, link, qp, report, senses, tick, timer
 from trotd.bench.corpus import KINDS, Corpus
+from trotd.bench.daemon import Slice
 from trotd.bench.exact import constraints, exact_forces, is_minimum
+from trotd.bench.host import Window
 
 
 def test_corpus_is_the_same_for_the_same_seed_and_has_every_kind_and_number_of_legs() -> None:
@@ -151,3 +153,15 @@ def test_the_replies_that_are_decoded_are_the_makers_too() -> None:
     moteus = pytest.importorskip("moteus")
     said = moteus.parse_registers(codecs._reply(0.125, -0.5, 3.25)).response
     assert [said[register] for register in (0, 1, 2, 3)] == pytest.approx([10, 0.125, -0.5, 3.25])
+
+
+def test_ticks_of_a_window_that_the_host_disturbed_do_not_count() -> None:
+    stamp = np.arange(0.0, 3.0, 0.1)
+    overruns = np.where(stamp < 1.05, 0, 4) + np.where(stamp > 2.45, 2, 0)  # four in the disturbed second, two after it
+    ticks = np.zeros(len(stamp), TICK_DTYPE)
+    whole = Slice(stamp.copy(), stamp.copy(), stamp, overruns, ticks)
+    windows = [Window(-0.05, 0.95, 0.0), Window(0.95, 1.95, 0.02), Window(1.95, 2.95, 0.0)]
+    calm = timer.undisturbed(whole, windows)
+    assert calm.windows == 2
+    assert calm.missed == 2
+    np.testing.assert_array_equal(calm.lateness, np.r_[stamp[:10], stamp[20:30]])

@@ -43,8 +43,8 @@ class Slice:
     """µs."""
     stamp: np.ndarray
     """s monotonic."""
-    missed: int
-    ticks: int
+    overruns: np.ndarray
+    """Deadlines that have gone by without a tick of their own, counted at each tick."""
     records: Records
     """All of the recording, what did not walk too."""
 
@@ -106,8 +106,7 @@ def _read(folder: Path, rate: float) -> Slice:
     ticks = recording.ticks
     walking = ticks[ticks["mode"] == WALK]
     walking = walking[round(0.5 * rate) :]  # the first moments load what no tick after them loads
-    missed = int(walking["overruns"][-1]) - int(walking["overruns"][0])
-    return Slice(1e6 * walking["lateness"], 1e6 * walking["compute"], walking["stamp"], missed, len(walking), ticks)
+    return Slice(1e6 * walking["lateness"], 1e6 * walking["compute"], walking["stamp"], walking["overruns"], ticks)
 
 
 def _robot_file(folder: Path, fifo: bool, seconds: int, extra: str) -> Path:
