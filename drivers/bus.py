@@ -29,6 +29,13 @@ class BusCounters:
     bus_off: int = 0
     reopened: int = 0
 
+    def troubles(self) -> dict[str, int]:
+        """What of it should not be, by its name."""
+        return {
+            "frames not sent": self.send_failures, "error frames": self.error_frames, "bus-off": self.bus_off,
+            "bus reopened": self.reopened,
+        }  # fmt: skip
+
 
 class Bus(Protocol):
     """A back-end."""

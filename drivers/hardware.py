@@ -46,6 +46,10 @@ class Imu(Protocol):
     async def close(self) -> None:
         """Never raises."""
 
+    def troubles(self) -> dict[str, int]:
+        """What went wrong since ``connect``, counted, by its name."""
+        ...
+
 
 def build_bus(bus: BusConfig, motors: MotorsConfig) -> Bus:
     """The back-end that ``bus`` names.
@@ -123,6 +127,12 @@ class HardwareRobot:
             raise BusTimeout(f"no motor answered for {joints.age.min() * 1e3:.0f} ms: supply? emergency stop? bus?")
         self._faulty = bool((~np.isin(joints.fault, _NOT_CLEARABLE)).any())
         return Measurement(stamp, self.imu.latest(), joints, self.motors.voltage)
+
+    @property
+    def troubles(self) -> dict[str, int]:
+        """See ``Robot.troubles``: of the motors' replies, of the buses and of the IMU."""
+        counted = self.motors.counters.troubles() | self.motors.bus.counters.troubles() | self.imu.troubles()
+        return {name: count for name, count in counted.items() if count}
 
     async def close(self) -> None:
         """See ``Robot.close``."""

@@ -106,6 +106,13 @@ class MotorCounters:
     """Frames that are not from a motor of ours: echoes, other devices."""
     corrupt: int = 0
 
+    def troubles(self) -> dict[str, int]:
+        """What of it should not be, by its name; echoes and other devices may well be there."""
+        return {
+            "replies missed": self.missed, "replies late": self.late, "replies twice": self.duplicate,
+            "replies corrupt": self.corrupt,
+        }  # fmt: skip
+
 
 Purpose = Literal["command", "query", "stop"]
 _MODE, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _TEMPERATURE, _FAULT = range(7)

@@ -46,6 +46,11 @@ class NullRobot:
         imu = ImuSample(stamp, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, GRAVITY]))
         return Measurement(stamp, imu, joints, 48.0)
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """None: there are no wires."""
+        return {}
+
     async def close(self) -> None:
         """Nothing to close."""
         self._connected = False

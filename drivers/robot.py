@@ -6,6 +6,7 @@ SI units, float64. Arrays of legs have rows ``FL FR BL BR`` and columns ``abduct
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -122,3 +123,7 @@ class Robot(Protocol):
 
     async def close(self) -> None:
         """Leave the motors without torque and release the wires. Never raises."""
+
+    @property
+    def troubles(self) -> Mapping[str, int]:
+        """What went wrong on the wires since ``connect``, counted, by its name; only what happened."""

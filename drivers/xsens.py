@@ -49,6 +49,13 @@ class ImuCounters:
     self_test_failed: int = 0
     restarts: int = 0
 
+    def troubles(self) -> dict[str, int]:
+        """What of it should not be, by its name."""
+        return {
+            "IMU samples lost": self.lost, "IMU samples corrupt": self.corrupt, "IMU samples clipped": self.clipped,
+            "IMU restarts": self.restarts,
+        }  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True)
 class ImuIdentity:
@@ -101,6 +108,10 @@ class Xsens:
             self.link.close()
             raise
         self._keeper = asyncio.create_task(self._keep_alive(), name="imu")
+
+    def troubles(self) -> dict[str, int]:
+        """What went wrong since the start, counted, by its name."""
+        return self.counters.troubles()
 
     def latest(self) -> ImuSample:
         """The newest sample, in the body's frame.

@@ -377,7 +377,8 @@ class Daemon:
         """Everything that people want to see."""
         compute = self._compute[: min(len(self._compute), max(1, self.flight.recorder.count))]
         refused = self.link.entrance.refused
-        return build_status(self.cycle, self.shelf.active, compute, refused, self.flight.refused)
+        wires = self.job.body.troubles
+        return build_status(self.cycle, self.shelf.active, compute, refused, self.flight.refused, wires)
 
     def _checks(self) -> tuple[ArmingCheck, ...]:
         """What the arming list has to say of the operator and of the body."""

@@ -182,6 +182,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """How often the flight recorder could not write, by the reason."""
     refused: dict[str, int] = {}
     """How many messages were refused or shed since the start, by key."""
+    wires: dict[str, int] = {}
+    """What went wrong on the body's wires since the start, by its name: late and missed replies, frames, samples."""
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):

@@ -15,7 +15,12 @@ from runtime.shelf import PolicyFile
 
 
 def build_status(
-    cycle: Cycle, active: PolicyFile, compute: Array, refused: Mapping[str, int], unwritten: Mapping[str, int]
+    cycle: Cycle,
+    active: PolicyFile,
+    compute: Array,
+    refused: Mapping[str, int],
+    unwritten: Mapping[str, int],
+    wires: Mapping[str, int],
 ) -> Status:
     """Everything that people want to see; ``compute`` holds the last ticks' times (n,), n >= 1, s."""
     tick, current, config = cycle.tick[0], cycle.state, cycle.config
@@ -46,6 +51,7 @@ def build_status(
         solver={status.name: int(n) for status, n in zip(SolverStatus, cycle.solver, strict=True) if n},
         recordings_refused=dict(unwritten),
         refused=dict(refused),
+        wires=dict(wires),
     )
 
 

@@ -68,6 +68,11 @@ class SimRobot:
         """Push the body from now on: N in the world frame, s."""
         self.world.push(force, duration)
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """None: there are no wires."""
+        return {}
+
     async def close(self) -> None:
         """Release the simulator."""
         world, self._world = self._world, None

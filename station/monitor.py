@@ -184,7 +184,7 @@ def examine(ticks: Records, status: Status, config: Config, lost: int) -> list[C
     hottest = float(ticks["joint_temperature"][-1].max())
     voltage = float(ticks["voltage"][-1])
     fell_back = float((ticks["solver_status"] > SolverStatus.SOLVED).mean())
-    share = rate / status.rate_hz
+    share, wrong = rate / status.rate_hz, sum(status.wires.values()) / max(1, status.ticks)
     return [
         Check("mode", Level.BAD if status.fault else Level.OK, f"{status.mode}, {status.fault or status.reason}"),
         Check("rate", _level(1 - share, 0.01, 0.05), f"{rate:.1f} of {status.rate_hz:g} Hz"),
@@ -207,8 +207,14 @@ def examine(ticks: Records, status: Status, config: Config, lost: int) -> list[C
             f"{voltage:.1f} V, bound {limits.min_voltage:g}",
         ),
         Check("solver", _level(fell_back, 0.001, 0.05), f"{fell_back:.1%} of the ticks not by the first solver"),
+        Check("wires", _level(wrong, 0.001, math.inf), wires_in_words(status)),
         Check("link", _level(lost / len(ticks), 0.01, 0.5), f"{lost} ticks lost on the way here"),
     ]
+
+
+def wires_in_words(status: Status) -> str:
+    """What went wrong on the wires since the daemon's start."""
+    return ", ".join(f"{count} {name}" for name, count in status.wires.items()) or "nothing lost, nothing late"
 
 
 def _level(value: float, warning: float, bad: float) -> Level:

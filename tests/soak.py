@@ -32,16 +32,22 @@ def _print_json(report: object) -> None:
 def daemon(
     minutes: Annotated[float, typer.Option(help="How long it walks.")] = 60.0,
     robot: Annotated[str, typer.Option(help="A shipped robot or a .toml file.")] = "stoch3",
+    wire: Annotated[bool, typer.Option("--wire", help="On the wire twin, over its buses and its IMU's line.")] = False,
+    rate_hz: Annotated[float, typer.Option(help="Ticks a second.")] = 200.0,
     json: JsonOption = False,
 ) -> None:
-    """The daemon walks on the simulator in real time, driven by a joystick, with a monitor and a viewer attached.
+    """The daemon walks on the simulator or its wire twin in real time: a joystick drives, a monitor and a viewer watch.
 
     Its memory may grow by 5 MiB; it may not fall, nor leave the walk unasked. Missed ticks are counted: on a busy
     machine they say more about the machine.
     """
     console = Console(stderr=True)
     with console.status("starting the daemon") as line:
-        shift = work(minutes, robot, lambda words: line.update(Text(words, no_wrap=True, overflow="ellipsis")))
+
+        def show(words: str) -> None:
+            line.update(Text(words, no_wrap=True, overflow="ellipsis"))
+
+        shift = work(minutes, robot, "twin" if wire else "sim", rate_hz, show)
     problems = shift.problems(GROWTH)
     if json:
         _print_json({"shift": shift, "problems": problems})
@@ -56,6 +62,7 @@ def _print_shift(shift: Shift, problems: list[str]) -> None:
     for name, value in (
         ("walked", f"{shift.minutes:g} min, {shift.distance:.0f} m"),
         ("ticks", f"{shift.ticks}, missed {shift.missed} ({100 * missed_share(shift):.2f} %)"),
+        ("wires", ", ".join(f"{count} {name}" for name, count in shift.wires.items()) or "nothing lost, nothing late"),
         ("memory", f"{shift.resident:.1f} MiB, grew by {shift.growth:.2f}, bound {GROWTH:g}"),
         ("falls", str(shift.falls)),
     ):

@@ -42,6 +42,9 @@ class StillImu:
     async def close(self) -> None:
         self.closed = True
 
+    def troubles(self) -> dict[str, int]:
+        return {"IMU samples lost": 0, "IMU restarts": 2}
+
 
 class Body:
     """A robot whose legs stand at ``STAND``."""
@@ -140,6 +143,16 @@ def test_one_silent_motor_ages_by_a_tick_a_tick():
     body.bench.servos[2].silent = True
     ages = [body.run(DAMP).joints.age[0, 2] for _ in range(3)]
     assert ages == pytest.approx([0.005, 0.010, 0.015], abs=1e-4)
+
+
+def test_what_went_wrong_on_the_wires_is_counted_by_its_name():
+    body = Body()
+    body.connect()
+    body.run(DAMP)
+    assert body.robot.troubles == {"IMU restarts": 2}
+    body.bench.servos[5].silent = True
+    body.run(DAMP, DAMP)
+    assert body.robot.troubles == {"IMU restarts": 2, "replies missed": 2}
 
 
 def test_all_silent_for_longer_than_coasting_is_a_bus_timeout_and_not_the_end():

@@ -11,7 +11,7 @@ from scenes import robot
 
 from runtime.control.records import Clamp, SolverStatus
 from runtime.messages import TICK_DTYPE, Mode, Status
-from station.monitor import CLAMP_WORDS, Check, Level, draw_table, examine, summarise
+from station.monitor import CLAMP_WORDS, Check, Level, draw_table, examine, summarise, wires_in_words
 
 PEAK = np.array(robot().robot.joints.peak_torque)
 N = 400
@@ -39,7 +39,7 @@ def status(**changes: Any) -> Status:
         values
         | triples
         | {"armed": True, "policy": "", "rate_hz": 200.0, "clamps": {}, "solver": {}}
-        | {"recordings_refused": {}, "refused": {}, "evidence": None}
+        | {"recordings_refused": {}, "refused": {}, "wires": {}, "evidence": None}
         | changes,
         Status,
     )
@@ -120,3 +120,13 @@ def test_every_clamp_has_words_and_its_share_of_the_ticks() -> None:
 def test_checks_travel_as_json() -> None:
     checks = examine(healthy(), status(), robot(), 0)
     assert msgspec.json.decode(msgspec.json.encode(checks), type=list[Check]) == checks
+
+
+def test_what_goes_wrong_on_the_wires_is_a_warning_when_it_is_more_than_one_in_a_thousand() -> None:
+    ticks = healthy()
+    found = [
+        {check.name: check.level for check in examine(ticks, status(ticks=100_000, wires=wires), robot(), 0)}["wires"]
+        for wires in ({"replies late": 90}, {"replies late": 90, "bus-off": 20})
+    ]
+    assert found == [Level.OK, Level.WARNING]
+    assert wires_in_words(status(wires={"replies late": 90, "bus-off": 2})) == "90 replies late, 2 bus-off"

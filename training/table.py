@@ -33,7 +33,7 @@ class Size:
     """How much is tested."""
 
     seeds: int = 20
-    walk: float = 12.0
+    walk: float = 60.0
     """s of each velocity of the grid."""
     draws: int = 200
     phases: int = 8

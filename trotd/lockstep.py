@@ -63,6 +63,10 @@ class LockstepImu:
     async def connect(self) -> None:
         """Nothing to open."""
 
+    def troubles(self) -> dict[str, int]:
+        """None: its bytes cannot be lost."""
+        return {}
+
     def latest(self) -> ImuSample:
         """The newest sample.
 

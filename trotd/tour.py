@@ -54,7 +54,7 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
     with contextlib.ExitStack() as stack:
         body = "sim"
         if wire:
-            body, arguments = "twin", stack.enter_context(_twin(config.robot.name, endpoint, arguments))
+            body, arguments = "twin", stack.enter_context(running_twin(config.robot.name, endpoint, arguments))
         output = stack.enter_context(tempfile.TemporaryFile("w+"))
         line = stack.enter_context(console.status("starting the daemon"))
         child = subprocess.Popen(
@@ -81,8 +81,13 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
 
 
 @contextlib.contextmanager
-def _twin(robot: str, endpoint: str, arguments: Sequence[str]) -> Iterator[list[str]]:
-    """A running twin; the daemon's arguments, with the state folder that they share."""
+def running_twin(robot: str, endpoint: str, arguments: Sequence[str]) -> Iterator[list[str]]:
+    """A running twin for a daemon with ``arguments``, among them --robot and --rate-hz; those, with the state folder
+    that both share.
+
+    Raises:
+        DaemonFailed: it does not start.
+    """
     arguments = list(arguments)
     with contextlib.ExitStack() as stack:
         if "--state" not in arguments:

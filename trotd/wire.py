@@ -141,6 +141,11 @@ class LockstepRobot:
         """See ``Robot.close``."""
         await self._robot.close()
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """See ``Robot.troubles``."""
+        return self._robot.troubles
+
     def _packets(self) -> int:
         counters = self._imu.counters
         return counters.samples + counters.lost + counters.corrupt + self._imu.link.corrupt

@@ -25,6 +25,7 @@ from station.driving import Driving
 from station.joystick import Joystick
 from station.pad import Sticks
 from station.session import Station, StationError, connected
+from trotd.tour import running_twin
 
 SETTLING = 0.1
 """Share of the time, from the start, in which memory may still grow: buffers fill, the ring's pages are touched."""
@@ -38,6 +39,9 @@ class Shift(msgspec.Struct, kw_only=True):
     """What it was like."""
 
     minutes: float
+    rate_hz: float = 0.0
+    wires: dict[str, int] = {}
+    """What went wrong on them, counted."""
     ticks: int = 0
     missed: int = 0
     """Ticks whose deadline went by."""
@@ -99,12 +103,21 @@ def resident(process: psutil.Process) -> float:
     return float(process.memory_info().rss) / 2**20
 
 
-def work(minutes: float, robot: str, show: Callable[[str], None]) -> Shift:
-    """One shift. Raises ``StationError`` where the daemon does not start."""
-    shift = Shift(minutes=minutes, ends=[], clients={})
-    with tempfile.TemporaryDirectory(prefix="trotd-soak-") as name, contextlib.ExitStack() as stack:
-        folder, endpoint = Path(name), _free_endpoint()
-        daemon = stack.enter_context(_process(folder, "daemon", _daemon_command(robot, endpoint, folder)))
+def work(minutes: float, robot: str, body: str, rate_hz: float, show: Callable[[str], None]) -> Shift:
+    """One shift on the simulator (``sim``) or on the wires of its twin (``twin``).
+
+    Raises:
+        StationError: the daemon does not start.
+    """
+    shift = Shift(minutes=minutes, rate_hz=rate_hz, ends=[], clients={})
+    with tempfile.TemporaryDirectory(prefix="trotd-soak-") as place, contextlib.ExitStack() as stack:
+        folder, endpoint = Path(place), _free_endpoint()
+        arguments = ["--robot", robot, "--rate-hz", f"{rate_hz:g}", "--state", str(folder)]
+        if body == "twin":
+            name = config.load(config.find_robot(robot)).robot.name
+            arguments = stack.enter_context(running_twin(name, endpoint, arguments))
+        command = ["run", "--body", body, "--listen", endpoint, *arguments]
+        daemon = stack.enter_context(_process(folder, "daemon", command))
         station = stack.enter_context(_reached(robot, endpoint, daemon))
         _stand_and_walk(station)
         clients = {
@@ -151,7 +164,7 @@ def _drive(station: Station, daemon: subprocess.Popen[bytes], shift: Shift, show
         status = joystick.status
         if status is not None:
             base = status.overruns if base is None else base
-            shift.ticks, shift.missed = status.ticks, status.overruns - base
+            shift.ticks, shift.missed, shift.wires = status.ticks, status.overruns - base, status.wires
             if status.mode != mode:
                 mode = status.mode
                 shift.ends.append(f"{now:.0f} s {mode}: {status.fault or status.reason}")
@@ -172,10 +185,6 @@ def _drive(station: Station, daemon: subprocess.Popen[bytes], shift: Shift, show
         shift.resident, shift.growth = settled[-1], settled[-1] - settled[0]
     if daemon.poll() is not None:
         shift.ends.append(f"the daemon ended with code {daemon.returncode}")
-
-
-def _daemon_command(robot: str, endpoint: str, folder: Path) -> list[str]:
-    return ["run", "--body", "sim", "--robot", robot, "--listen", endpoint, "--state", str(folder)]
 
 
 def _stand_and_walk(station: Station) -> None:

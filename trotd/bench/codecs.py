@@ -154,6 +154,9 @@ class _Still:
         """See ``Imu``."""
         return self.sample
 
+    def troubles(self) -> dict[str, int]:
+        return {}
+
     async def close(self) -> None:
         """Nothing to close."""
 

@@ -142,7 +142,7 @@ class _Lying:
         self._compute = np.zeros(round(RATE))
 
     def status(self) -> Status:
-        return build_status(self._cycle, self._active, self._compute, {}, {})
+        return build_status(self._cycle, self._active, self._compute, {}, {}, {})
 
 
 def publishing(seconds: float) -> Iterator[Finding]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from station.session import StationError
 from trotd.bench.daemon import PRIORITY, Disturbed, Slice, may_fifo, walking_daemon
 from trotd.bench.host import Window, stolen_time, watched
 from trotd.bench.report import Figure, Finding, Missing, shown
@@ -58,7 +59,7 @@ def beside_cyclictest(rate: float, fifo: bool, slices: int, seconds: int) -> Ite
     for _ in shown(range(slices), name, slices):
         try:
             calm, watched_windows = run_daemon(rate, fifo, seconds)
-        except Disturbed as error:
+        except (Disturbed, StationError) as error:
             yield Missing("timer", name, f"a slice is left out: {error}")
             continue
         windows += watched_windows
