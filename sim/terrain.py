@@ -1,4 +1,4 @@
-"""The ground: pure descriptions that know their own height; ``sim.world`` makes collision shapes of them."""
+"""The ground: pure descriptions that know their own height; ``sim.bullet.ground`` makes collision shapes of them."""
 
 from __future__ import annotations
 

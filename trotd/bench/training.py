@@ -99,11 +99,11 @@ def _listen(stage: Stage, task: Task) -> list[Call]:
     """Every call of an episode, its reset too; the first episode only compiles."""
     _play(stage, task)
     world: Any = stage.world
-    engine, world._bullet = world._bullet, Listening(world._bullet)
+    bullet = world._engine.bullet
+    world._engine.bullet = world._robot.bullet = listening = Listening(bullet)
     _play(stage, task)
-    calls: list[Call] = world._bullet.calls
-    world._bullet = engine
-    return calls
+    world._engine.bullet = world._robot.bullet = bullet
+    return listening.calls
 
 
 def _replay(calls: list[Call]) -> float:
