@@ -14,7 +14,7 @@ from typing import Any
 
 import zenoh
 
-from runtime.messages import Keys
+from runtime.messages.keys import Keys
 
 
 class Role(StrEnum):

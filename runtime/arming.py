@@ -16,7 +16,7 @@ from runtime.control.kinematics import GRAVITY
 from runtime.control.policy import Policy
 from runtime.control.records import Records, VelocityCommand
 from runtime.guard import Guard, joint_name, tilt
-from runtime.messages import ArmingCheck
+from runtime.messages.mode import ArmingCheck
 from runtime.modes import Reason
 from runtime.parameters import ArmingConfig, LimitsConfig
 

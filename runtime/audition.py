@@ -21,7 +21,7 @@ from runtime.control.records import CONTROL_DTYPE, Clamp, SolverStatus
 from runtime.control.shadow import SUMS_DTYPE, shadow
 from runtime.control.state import STATE_DTYPE
 from runtime.cycle import Cycle
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from runtime.parameters import AuditionConfig
 from runtime.policies import PolicyError
 from runtime.shelf import PolicyFile, Shelf

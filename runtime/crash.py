@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.description import UNDECODABLE
 from drivers.durable import write_whole
-from runtime.messages import Event
+from runtime.messages.event import Event
 from runtime.recorder import CHUNK, KEYFRAMES
 from runtime.recording import SUFFIX, Header, dtype_of, prune, save, stem
 from runtime.ring import Rows, open_left

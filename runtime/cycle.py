@@ -22,7 +22,10 @@ from runtime.control.policy import Policy
 from runtime.control.records import CONTROL_DTYPE, Clamp, Records, SolverStatus, VelocityCommand
 from runtime.guard import Guard
 from runtime.keyframe import KEYFRAME_DTYPE
-from runtime.messages import CONTROL_OFFSET, TICK_DTYPE, TUNED, ArmingCheck, Event, Evidence, Mode, Request
+from runtime.messages.event import Event
+from runtime.messages.fault import Evidence
+from runtime.messages.mode import ArmingCheck, Mode, Request
+from runtime.messages.tick import CONTROL_OFFSET, TICK_DTYPE, TUNED
 from runtime.modes import Answer, ModeState, Reaction, Reason
 from runtime.sources import COMMAND_FIELDS, Sources
 

@@ -29,19 +29,13 @@ from runtime.doors import Channel, Outcome
 from runtime.faults import FaultHistory, fault_file
 from runtime.flight_log import FlightLog
 from runtime.link import Link
-from runtime.messages import (
-    ArmingCheck,
-    FaultRecord,
-    Keys,
-    ModeReply,
-    PolicyEntry,
-    PoseMessage,
-    Request,
-    Status,
-    TuningEntry,
-    TuningReply,
-    TuningRequest,
-)
+from runtime.messages.fault import FaultRecord
+from runtime.messages.keys import Keys
+from runtime.messages.mode import ArmingCheck, ModeReply, Request
+from runtime.messages.motion import PoseMessage
+from runtime.messages.policy import PolicyEntry
+from runtime.messages.status import Status
+from runtime.messages.tuning import TuningEntry, TuningReply, TuningRequest
 from runtime.modes import Reason
 from runtime.shelf import PolicyFile, Shelf
 from runtime.status import build_status

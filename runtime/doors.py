@@ -20,27 +20,20 @@ import msgspec
 import numpy as np
 import zenoh
 
-from runtime import messages, policies
+from runtime import policies
 from runtime.config import Config
 from runtime.control.records import VelocityCommand
 from runtime.delays import Delays
-from runtime.messages import (
-    FaultRecord,
-    Keys,
-    MessageError,
-    ModeReply,
-    PolicyEntry,
-    PolicyReply,
-    PoseMessage,
-    RecordingEntry,
-    RecordingReply,
-    Request,
-    Status,
-    TuningEntry,
-    TuningReply,
-    TuningRequest,
-    VelocityMessage,
-)
+from runtime.messages.decoding import LARGEST_MESSAGE, MessageError
+from runtime.messages.fault import FaultRecord
+from runtime.messages.keys import Keys
+from runtime.messages.mode import ModeReply, Request, decode_request
+from runtime.messages.motion import PoseMessage, VelocityMessage, decode_pose, decode_velocity
+from runtime.messages.policy import PolicyEntry, PolicyReply
+from runtime.messages.recording import RecordingEntry, RecordingReply
+from runtime.messages.status import Status
+from runtime.messages.tick import tick_schema
+from runtime.messages.tuning import TuningEntry, TuningReply, TuningRequest, decode_tuning
 from runtime.recording import list_recordings
 from runtime.shelf import PolicyFile
 
@@ -128,7 +121,7 @@ class Entrance:
                     (keys.change_tuning, self._answer_change),
                     (keys.recording, self._answer_recording),
                     (keys.faults, self._answer_faults),
-                    (keys.tick_schema, lambda _query: messages.tick_schema()),
+                    (keys.tick_schema, lambda _query: tick_schema()),
                 )
             ),
             session.declare_queryable(keys.policy, self._answer_policy),
@@ -165,7 +158,7 @@ class Entrance:
         stamp = time.monotonic()
         bounds = self._config.control.bounds
         try:
-            message = messages.decode_velocity(_bytes(sample.payload), bounds.linear_velocity, bounds.yaw_rate)
+            message = decode_velocity(_bytes(sample.payload), bounds.linear_velocity, bounds.yaw_rate)
         except MessageError as error:
             self._refuse(self._keys.velocity, str(error))
             return
@@ -199,7 +192,7 @@ class Entrance:
 
     def _hear_pose(self, sample: zenoh.Sample) -> None:
         try:
-            pose = messages.decode_pose(_bytes(sample.payload))
+            pose = decode_pose(_bytes(sample.payload))
             self._wait(lambda: self._doors.take_pose(pose))
         except ValueError as error:
             self._refuse(self._keys.pose, str(error))
@@ -248,7 +241,7 @@ class Entrance:
 
     def _answer_mode(self, query: zenoh.Query) -> bytes:
         try:
-            wish = messages.decode_request(_payload(query))
+            wish = decode_request(_payload(query))
         except MessageError as error:
             why = str(error)
             self._refuse(self._keys.mode, why)
@@ -260,7 +253,7 @@ class Entrance:
 
     def _answer_change(self, query: zenoh.Query) -> bytes:
         try:
-            change = messages.decode_tuning(_payload(query))
+            change = decode_tuning(_payload(query))
             done: Future[TuningReply] = Future()
             self._wait(lambda: self._doors.take_tuning(change, done))
             reply = done.result(ANSWER_TIMEOUT)
@@ -336,12 +329,12 @@ class Entrance:
         return files[name].read_bytes()
 
 
-def _bytes(payload: Any, bound: int = messages.LARGEST_MESSAGE) -> bytes:
+def _bytes(payload: Any, bound: int = LARGEST_MESSAGE) -> bytes:
     """A payload, unless it is larger than what its key carries: then it is not even copied."""
     if len(payload) > bound:
         raise MessageError(f"{len(payload)} bytes; a message here has at most {bound}")
     return bytes(payload)
 
 
-def _payload(query: zenoh.Query, bound: int = messages.LARGEST_MESSAGE) -> bytes:
+def _payload(query: zenoh.Query, bound: int = LARGEST_MESSAGE) -> bytes:
     return b"" if query.payload is None else _bytes(query.payload, bound)

@@ -10,7 +10,7 @@ its legs. Judged only while the robot is not damped, since limp joints are moved
 from __future__ import annotations
 
 from runtime.control.compilation import compiled
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from runtime.modes import Reason
 from runtime.verdict import find
 

@@ -14,7 +14,7 @@ import msgspec
 
 from drivers.durable import write_whole
 from runtime.cycle import Fault
-from runtime.messages import FaultRecord
+from runtime.messages.fault import FaultRecord
 
 VERSION = 1
 KEPT = 200

@@ -24,7 +24,7 @@ import msgspec
 from runtime import crash
 from runtime.config import Config
 from runtime.cycle import Cycle
-from runtime.messages import Event
+from runtime.messages.event import Event
 from runtime.recorder import Recorder
 from runtime.recording import Header, layout, stem
 

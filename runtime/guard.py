@@ -14,7 +14,8 @@ from runtime.control.records import Clamp, Records
 from runtime.derating import derate_joint, derate_speed, ramp_up
 from runtime.encoders import look_at_encoder
 from runtime.limits import bound_command, judge_body, judge_joint, judge_load, judge_policy
-from runtime.messages import TICK_DTYPE, Evidence
+from runtime.messages.fault import Evidence
+from runtime.messages.tick import TICK_DTYPE
 from runtime.modes import Reaction, Reason, reaction
 from runtime.parameters import DegradeConfig, LimitsConfig
 from runtime.plausibility import keep_time, look_at_imu, look_at_joint, look_at_motor

@@ -10,7 +10,8 @@ from drivers.robot import JointCommand
 from runtime.control.posture import POSTURE_DTYPE
 from runtime.control.records import Records, VelocityCommand
 from runtime.control.state import STATE_DTYPE
-from runtime.messages import TUNED, Mode
+from runtime.messages.mode import Mode
+from runtime.messages.tick import TUNED
 from runtime.modes import ModeState, Reason
 from runtime.sources import COMMAND_FIELDS
 from runtime.verdict import MEMORY_DTYPE

@@ -10,7 +10,7 @@ import math
 
 from runtime.control.compilation import compiled
 from runtime.control.records import Clamp
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from runtime.modes import Reason
 from runtime.verdict import find
 

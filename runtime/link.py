@@ -21,7 +21,9 @@ from runtime.access import AccessError, control_access, use_certificates
 from runtime.config import Config
 from runtime.control.records import Records
 from runtime.doors import Channel, Doors, Entrance
-from runtime.messages import TICK_DTYPE, Event, Keys
+from runtime.messages.event import Event
+from runtime.messages.keys import Keys
+from runtime.messages.tick import TICK_DTYPE
 from runtime.parameters import LinkConfig
 
 WAITING_EVENTS = 1000

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import assert_never
 
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 
 
 class Reason(IntEnum):

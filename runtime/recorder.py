@@ -11,7 +11,8 @@ import numpy as np
 
 from runtime.control.records import Records
 from runtime.cycle import KEYFRAME_DTYPE
-from runtime.messages import TICK_DTYPE, Event
+from runtime.messages.event import Event
+from runtime.messages.tick import TICK_DTYPE
 from runtime.recording import SUFFIX, Header, prune, save
 from runtime.ring import Kind, create
 

@@ -22,7 +22,8 @@ import numpy as np
 from drivers.description import UNDECODABLE
 from drivers.durable import replacing
 from runtime.control.records import Records
-from runtime.messages import TICK_DTYPE, Event
+from runtime.messages.event import Event
+from runtime.messages.tick import TICK_DTYPE
 
 VERSION = 1
 _MARK = b"trotd recording "

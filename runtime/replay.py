@@ -18,7 +18,8 @@ from runtime import config, policies
 from runtime.control.policy import Policy
 from runtime.control.records import COMMAND_FIELDS, ESTIMATE_FIELDS, FEET_FIELDS, Clamp, Records, VelocityCommand
 from runtime.cycle import KEYFRAME_DTYPE, Cycle, Wake
-from runtime.messages import TICK_DTYPE, TUNED, Mode, Request
+from runtime.messages.mode import Mode, Request
+from runtime.messages.tick import TICK_DTYPE, TUNED
 from runtime.modes import Reason
 from runtime.recording import Recording, RecordingError
 

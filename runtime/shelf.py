@@ -13,7 +13,7 @@ from drivers.durable import write_whole
 from runtime import policies
 from runtime.control.policy import Policy, encode_policy
 from runtime.cycle import Cycle
-from runtime.messages import PolicyEntry
+from runtime.messages.policy import PolicyEntry
 
 GOOD = 4
 """Policies that proved good and can be rolled back to."""

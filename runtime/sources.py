@@ -9,7 +9,7 @@ from runtime.config import Config
 from runtime.control.controller import Controller
 from runtime.control.posture import Posture, blend, minimum_jerk
 from runtime.control.records import Clamp, SolverStatus, VelocityCommand
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 
 COMMAND_FIELDS = ("position", "velocity", "kp", "kd", "torque")
 _DAMP, _STAND_UP, _STAND, _WALK, _SIT_DOWN = Mode  # an enum's attribute costs a microsecond before Python 3.12

@@ -9,7 +9,7 @@ import numpy as np
 from drivers.robot import Array
 from runtime.control.records import Clamp, SolverStatus
 from runtime.cycle import Cycle
-from runtime.messages import Status
+from runtime.messages.status import Status
 from runtime.modes import Reason
 from runtime.shelf import PolicyFile
 

@@ -20,7 +20,9 @@ from runtime.config import Config
 from runtime.control.gait import GAITS, gait_table
 from runtime.control.kinematics import inverse, leg_geometry
 from runtime.control.state import TUNING_DTYPE, build_parameters
-from runtime.messages import Mode, PoseMessage, TuningEntry
+from runtime.messages.mode import Mode
+from runtime.messages.motion import PoseMessage
+from runtime.messages.tuning import TuningEntry
 
 Value = float | str
 WALKED = tuple(name for name in GAITS if name != "stand")

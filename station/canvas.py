@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from drivers.description import RobotDescription
 from drivers.robot import JOINTS, LEGS, Array
 from runtime.control.records import Clamp, Records, SolverStatus
-from runtime.messages import Event, Mode
+from runtime.messages.event import Event
+from runtime.messages.mode import Mode
 from station.pose import body_position, heading_to_world, leg_points, orientation_xyzw, yaw_quaternion
 
 SCENE_HZ = 25.0

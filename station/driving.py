@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from runtime.messages import Mode, PoseMessage, Request
+from runtime.messages.mode import Mode, Request
+from runtime.messages.motion import PoseMessage
 from station.pad import GAITS, Sticks
 
 Velocity = tuple[float, float, float]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivers.robot import JOINTS, LEGS
-from runtime.messages import TICK_DTYPE
+from runtime.messages.tick import TICK_DTYPE
 from runtime.recording import Recording
 from station.ros_messages import definition, imu, joint_state, odometry, transforms, twist
 from station.session import StationError

@@ -18,7 +18,10 @@ from typing import Any, Protocol
 import msgspec
 import zenoh
 
-from runtime.messages import Mode, PoseMessage, Request, Status, TuningReply, TuningRequest
+from runtime.messages.mode import Mode, Request
+from runtime.messages.motion import PoseMessage
+from runtime.messages.status import Status
+from runtime.messages.tuning import TuningReply, TuningRequest
 from station.driving import STILL, Driving
 from station.pad import SourceLost, Sticks
 from station.session import Station

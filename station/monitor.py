@@ -14,7 +14,9 @@ from rich.table import Table
 from drivers.robot import JOINTS, LEGS, Array
 from runtime.config import Config
 from runtime.control.records import Clamp, Records, SolverStatus
-from runtime.messages import Event, Mode, Status
+from runtime.messages.event import Event
+from runtime.messages.mode import Mode
+from runtime.messages.status import Status
 from station.session import Station
 from station.ticks import TickStream
 

@@ -9,7 +9,7 @@ import msgspec
 
 from runtime import policies
 from runtime.control.policy import Policy
-from runtime.messages import PolicyEntry, PolicyReply
+from runtime.messages.policy import PolicyEntry, PolicyReply
 from station.session import Station, StationError
 
 VERDICT_TIMEOUT = 60.0

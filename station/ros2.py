@@ -19,7 +19,7 @@ import zenoh
 
 from runtime.control.parameters import BoundsConfig
 from runtime.delays import Delays
-from runtime.messages import VelocityMessage
+from runtime.messages.motion import VelocityMessage
 from station import cdr
 from station.cdr import CdrError
 from station.rmw_zenoh import Attachment, Node, Role, Topic, decode_attachment, gid_of

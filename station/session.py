@@ -17,7 +17,8 @@ import msgspec
 import zenoh
 
 from runtime.access import AccessError, use_certificates
-from runtime.messages import Keys, Status
+from runtime.messages.keys import Keys
+from runtime.messages.status import Status
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 Answer = TypeVar("Answer")

@@ -16,7 +16,8 @@ import zenoh
 
 from drivers.description import UNDECODABLE
 from runtime.control.records import Records
-from runtime.messages import TICK_DTYPE, Event
+from runtime.messages.event import Event
+from runtime.messages.tick import TICK_DTYPE
 from station.session import Station, StationError
 
 WAITING_BATCHES = 64

@@ -16,8 +16,11 @@ import zenoh
 
 from drivers.robot import Array
 from runtime.config import Config
-from runtime.control.records import Records
-from runtime.messages import Clamp, Event, Mode, ModeReply, Request, SimPush, SimTruth, Status
+from runtime.control.records import Clamp, Records
+from runtime.messages.event import Event
+from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.simulation import SimPush, SimTruth
+from runtime.messages.status import Status
 from station.session import Station, StationError
 from station.ticks import TickStream
 

@@ -6,7 +6,7 @@ import contextlib
 
 import msgspec
 
-from runtime.messages import TuningEntry, TuningReply, TuningRequest
+from runtime.messages.tuning import TuningEntry, TuningReply, TuningRequest
 from station.session import Station
 
 OWN = "own"

@@ -24,7 +24,7 @@ from runtime.control.policy import Policy
 from runtime.control.posture import Posture
 from runtime.cycle import Wake
 from runtime.daemon import Daemon, Job
-from runtime.messages import Mode, ModeReply, Request
+from runtime.messages.mode import Mode, ModeReply, Request
 from station.session import Station, StationError, connected
 
 _numbers = itertools.count()

@@ -24,10 +24,14 @@ from drivers.motors import Motors
 from drivers.mtdata2 import Data, SampleDecoder
 from drivers.survey import MitQuestion, MoteusQuestion, Question
 from drivers.xbus import Message, XbusParser
-from runtime import config, crash, messages, policies, recording
+from runtime import config, crash, policies, recording
 from runtime.config import ConfigError
 from runtime.keyframe import KEYFRAME_DTYPE
-from runtime.messages import TICK_DTYPE, MessageError
+from runtime.messages.decoding import MessageError
+from runtime.messages.mode import decode_request
+from runtime.messages.motion import decode_velocity
+from runtime.messages.simulation import decode_hold, decode_push
+from runtime.messages.tick import TICK_DTYPE, tick_schema
 from runtime.policies import PolicyError
 from runtime.recorder import EVENT_DTYPE, Recorder
 from runtime.recording import Header, RecordingError
@@ -174,10 +178,10 @@ ROBOT = config.load(config.find_robot("stoch3"))
 def zenoh_door(_folder: Path) -> Door:
     """Whatever the daemon, its twin and the desk hear from the network, but for policies."""
     listeners: tuple[Callable[[bytes], object], ...] = (
-        lambda data: messages.decode_velocity(data, (1.6, 0.6), 1.5),
-        messages.decode_request,
-        messages.decode_push,
-        messages.decode_hold,
+        lambda data: decode_velocity(data, (1.6, 0.6), 1.5),
+        decode_request,
+        decode_push,
+        decode_hold,
         read_schema,
     )
     seeds = [b'{"linear": [0.5, -0.1], "yaw_rate": 0.3}', b"stand", b'{"force":[10,0,0],"duration":0.1}']
@@ -189,9 +193,9 @@ def zenoh_door(_folder: Path) -> Door:
                 listen(data)
 
     def recover() -> None:
-        assert messages.decode_velocity(seeds[0], (1.6, 0.6), 1.5).yaw_rate == 0.3
+        assert decode_velocity(seeds[0], (1.6, 0.6), 1.5).yaw_rate == 0.3
 
-    return Door(take, (), [*seeds, messages.tick_schema()[:900]], recover, share=1.5, text=True)
+    return Door(take, (), [*seeds, tick_schema()[:900]], recover, share=1.5, text=True)
 
 
 @door("policy")

@@ -12,7 +12,8 @@ import msgspec
 
 from runtime import config, policies
 from runtime.control.policy import encode_policy
-from runtime.messages import Mode, ModeReply, RecordingEntry, Request
+from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.recording import RecordingEntry
 from runtime.recording import load
 from runtime.replay import replay
 from station.push import active, known, send

@@ -11,7 +11,7 @@ import pytest
 from test_cycle import Bench, spoil
 
 from runtime.control.records import Records, VelocityCommand
-from runtime.messages import ArmingCheck, Mode, Request
+from runtime.messages.mode import ArmingCheck, Mode, Request
 
 NAMES = [
     *("guard", "motors", "joints", "imu", "contacts", "supply", "temperature", "timing", "policy", "sticks"),

@@ -13,7 +13,7 @@ from walks import Walk
 from runtime import policies, recording
 from runtime.audition import Audition, Stage, Verdict
 from runtime.control.policy import Policy, encode_policy
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.policies import PolicyError, check_manifest, find_policy, load
 from runtime.replay import replay
 from runtime.shelf import PolicyFile, Shelf

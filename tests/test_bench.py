@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from runtime import config
-from runtime.messages import TICK_DTYPE, Mode
+from runtime.messages.mode import Mode
+from runtime.messages.tick import TICK_DTYPE
 from trotd.bench import codecs, command, link, qp, report, senses, tick, timer
 from trotd.bench.corpus import KINDS, Corpus
 from trotd.bench.daemon import Slice

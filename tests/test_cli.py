@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from daemons import free_endpoint
 
-from runtime.messages import ModeReply
+from runtime.messages.mode import ModeReply
 
 ROBOT = Path(__file__).parents[1] / "runtime" / "robots" / "stoch3.toml"
 

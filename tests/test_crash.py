@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from walks import Walk
 
 from runtime import crash
-from runtime.messages import Event, Mode, ModeReply, Request
+from runtime.messages.event import Event
+from runtime.messages.mode import Mode, ModeReply, Request
 from runtime.recorder import EVENT_DTYPE, EVENTS, Recorder, event_row
 from runtime.recording import SUFFIX, list_recordings, load
 from runtime.replay import replay

@@ -13,7 +13,7 @@ from daemons import Probe, is_damp, make_config, make_policy, wake
 from drivers.robot import JointCommand, Measurement, damp_command
 from runtime.control.records import Clamp, VelocityCommand
 from runtime.cycle import Cycle
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.modes import Reason
 
 

@@ -20,7 +20,11 @@ from drivers.errors import BusTimeout, DriverError
 from drivers.robot import Measurement
 from runtime.control.policy import encode_policy
 from runtime.link import LinkError
-from runtime.messages import Event, Mode, ModeReply, PolicyReply, RecordingReply, Request, Status
+from runtime.messages.event import Event
+from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.policy import PolicyReply
+from runtime.messages.recording import RecordingReply
+from runtime.messages.status import Status
 from runtime.recording import load
 from runtime.state import AlreadyRunning, lock, state_folder
 from runtime.systemd import Notifier

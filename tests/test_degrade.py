@@ -12,7 +12,7 @@ from walks import Walk
 from drivers.robot import Measurement
 from runtime.control.records import Clamp, VelocityCommand
 from runtime.cycle import Cycle
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.modes import Reason
 from sim.scenario import Scenario
 

@@ -8,7 +8,7 @@ from test_limits import CONFIG, healthy, make_guard
 
 from runtime.control.records import Clamp
 from runtime.guard import Guard
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from runtime.parameters import DegradeConfig, LimitsConfig
 
 

@@ -10,7 +10,7 @@ from daemons import Probe, is_damp, make_config, make_policy, wake
 
 from drivers.robot import damp_command
 from runtime.cycle import Cycle
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.modes import Reason
 
 WAYS: dict[str, list[Request | Mode | int]] = {

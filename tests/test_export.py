@@ -14,7 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scenes import rotation
 from walks import Walk
 
-from runtime.messages import TICK_DTYPE, Request
+from runtime.messages.mode import Request
+from runtime.messages.tick import TICK_DTYPE
 from runtime.recording import Recording, load
 from station.export import column_names, export_csv, export_mcap, start_of, tick_definition
 from station.ros_messages import JOINT_NAMES, definition

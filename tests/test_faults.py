@@ -13,7 +13,8 @@ from test_cycle import Bench, spoil
 
 from runtime.cycle import Fault
 from runtime.faults import KEPT, VERSION, FaultFileError, FaultHistory, fault_file, load_faults
-from runtime.messages import Evidence, FaultRecord, Mode, Request
+from runtime.messages.fault import Evidence, FaultRecord
+from runtime.messages.mode import Mode, Request
 from runtime.modes import Reason
 from station.session import Station
 

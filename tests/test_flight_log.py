@@ -13,7 +13,8 @@ import pytest
 from daemons import Served, make_config
 
 from drivers.robot import Measurement
-from runtime.messages import Mode, RecordingReply, Request
+from runtime.messages.mode import Mode, Request
+from runtime.messages.recording import RecordingReply
 from runtime.recording import list_recordings, load
 
 

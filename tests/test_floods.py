@@ -18,7 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.doors import SHED
-from runtime.messages import MessageError, Mode, decode_pose, decode_request, decode_tuning, decode_velocity
+from runtime.messages.decoding import MessageError
+from runtime.messages.mode import Mode, decode_request
+from runtime.messages.motion import decode_pose, decode_velocity
+from runtime.messages.tuning import decode_tuning
 from station.session import Station
 
 Script = Callable[[Served], Awaitable[None]]

@@ -19,7 +19,7 @@ from walks import Walk
 from drivers.robot import JointCommand, Measurement
 from runtime.control.kinematics import forward
 from runtime.control.records import Clamp, SolverStatus, VelocityCommand
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 
 FIELDS = ("position", "velocity", "kp", "kd", "torque")
 TORQUE = Clamp.TORQUE | Clamp.THERMAL | Clamp.CURRENT | Clamp.SOFT_START

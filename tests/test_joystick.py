@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 
 from runtime import config
 from runtime.control.records import Clamp
-from runtime.messages import Mode, PoseMessage, Request
+from runtime.messages.mode import Mode, Request
+from runtime.messages.motion import PoseMessage
 from station.driving import LEVEL, STILL, Driving
 from station.joystick import Joystick
 from station.keyboard import HOLD_SECONDS, Keys

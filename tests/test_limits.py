@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from drivers.robot import JointCommand, JointState, motor_torque
 from runtime.control.records import Clamp, Records
 from runtime.guard import Guard, tilt
-from runtime.messages import TICK_DTYPE, Mode
+from runtime.messages.mode import Mode
+from runtime.messages.tick import TICK_DTYPE
 from runtime.modes import Reason
 from runtime.parameters import LimitsConfig
 

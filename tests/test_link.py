@@ -22,22 +22,15 @@ from runtime.control.policy import encode_policy
 from runtime.control.records import VelocityCommand
 from runtime.doors import Channel, Outcome
 from runtime.link import Link, LinkError
-from runtime.messages import (
-    TICK_DTYPE,
-    Event,
-    MessageError,
-    ModeReply,
-    PolicyEntry,
-    PolicyReply,
-    PoseMessage,
-    RecordingEntry,
-    RecordingReply,
-    Request,
-    Status,
-    TuningEntry,
-    TuningReply,
-    TuningRequest,
-)
+from runtime.messages.decoding import MessageError
+from runtime.messages.event import Event
+from runtime.messages.mode import ModeReply, Request
+from runtime.messages.motion import PoseMessage
+from runtime.messages.policy import PolicyEntry, PolicyReply
+from runtime.messages.recording import RecordingEntry, RecordingReply
+from runtime.messages.status import Status
+from runtime.messages.tick import TICK_DTYPE
+from runtime.messages.tuning import TuningEntry, TuningReply, TuningRequest
 from runtime.policies import PolicyError
 from runtime.shelf import PolicyFile
 from station.session import Station, StationError, connected

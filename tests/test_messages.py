@@ -11,17 +11,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from runtime.messages import (
-    CONTROL_DTYPE,
-    CONTROL_OFFSET,
-    TICK_DTYPE,
-    MessageError,
-    Request,
-    decode_push,
-    decode_request,
-    decode_velocity,
-    tick_schema,
-)
+from runtime.control.records import CONTROL_DTYPE
+from runtime.messages.decoding import MessageError
+from runtime.messages.mode import Request, decode_request
+from runtime.messages.motion import decode_velocity
+from runtime.messages.simulation import decode_push
+from runtime.messages.tick import CONTROL_OFFSET, TICK_DTYPE, tick_schema
 
 LINEAR, YAW = (2.0, 0.8), 1.5
 anything = st.recursive(

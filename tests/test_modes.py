@@ -6,7 +6,7 @@ from itertools import product
 
 import pytest
 
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.modes import TABLE, WORDS, ModeState, Reason, advance, request
 
 FAULTS = [reason for reason in Reason if reason.is_fault]

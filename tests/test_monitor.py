@@ -10,7 +10,9 @@ import pytest
 from scenes import robot
 
 from runtime.control.records import Clamp, SolverStatus
-from runtime.messages import TICK_DTYPE, Mode, Status
+from runtime.messages.mode import Mode
+from runtime.messages.status import Status
+from runtime.messages.tick import TICK_DTYPE
 from station.monitor import CLAMP_WORDS, Check, Level, draw_table, examine, summarise, wires_in_words
 
 PEAK = np.array(robot().robot.joints.peak_torque)

@@ -19,7 +19,7 @@ import pytest
 from daemons import quick_robot
 from network import Cable, End, cabled
 
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from runtime.recording import list_recordings, load
 
 PORT = 7447

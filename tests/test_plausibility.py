@@ -12,7 +12,7 @@ from test_limits import healthy, make_guard
 from drivers.robot import LEGS
 from runtime.control.records import Clamp, Records
 from runtime.guard import Guard
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from runtime.modes import Reason
 
 PERIOD = 0.005

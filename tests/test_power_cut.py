@@ -18,7 +18,7 @@ from drivers.calibration import Calibration, fingerprint
 from drivers.durable import replacing
 from runtime import config, policies, recording
 from runtime.control.policy import encode_policy
-from runtime.messages import TICK_DTYPE
+from runtime.messages.tick import TICK_DTYPE
 from runtime.recording import Header, layout, list_recordings
 
 NAMES = ("first", "second", "third")

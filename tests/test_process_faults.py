@@ -25,7 +25,9 @@ from daemons import QUICK, Served, free_endpoint, is_damp, make_config, running
 from drivers import durable
 from runtime.config import ROBOTS
 from runtime.link import session_config
-from runtime.messages import Mode, ModeReply, RecordingReply, Request, Status
+from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.recording import RecordingReply
+from runtime.messages.status import Status
 from runtime.recording import list_recordings, load
 from station.session import Station, StationError, connected
 

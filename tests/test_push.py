@@ -12,7 +12,8 @@ from daemons import Served, make_config, make_policy
 
 from runtime.audition import Stage
 from runtime.control.policy import Policy, encode_policy
-from runtime.messages import PolicyReply, Request
+from runtime.messages.mode import Request
+from runtime.messages.policy import PolicyReply
 from runtime.policies import PolicyError
 from station.push import active, known, push, roll_back, send
 from station.session import Station

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.messages import TICK_DTYPE, Event
+from runtime.messages.event import Event
+from runtime.messages.tick import TICK_DTYPE
 from runtime.recorder import CHUNK, Recorder
 from runtime.recording import Header, RecordingError, layout, list_recordings, load
 

@@ -13,7 +13,8 @@ from walks import Walk, walk_around
 
 from runtime.config import ROBOTS
 from runtime.control.policy import Policy, encode_policy
-from runtime.messages import CONTROL_DTYPE, Mode, Request
+from runtime.control.records import CONTROL_DTYPE
+from runtime.messages.mode import Mode, Request
 from runtime.recording import Recording, load
 from runtime.replay import STAGES, ReplayError, compare_policy, replay
 

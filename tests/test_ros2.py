@@ -27,7 +27,8 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
 
 from runtime.config import ROBOTS
-from runtime.messages import TICK_DTYPE, Mode, ModeReply, Request
+from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.tick import TICK_DTYPE
 from station import cdr, ros_messages
 from station.cdr import CdrError
 from station.rmw_zenoh import Attachment, Node, Reliability, Role, Topic, decode_attachment, gid_of

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from daemons import Served, make_config
 
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from runtime.recording import load
 from station import tour
 from station.session import Station

@@ -16,7 +16,9 @@ from walks import Walk
 
 from runtime import config, recording
 from runtime.control.controller import Controller
-from runtime.messages import TICK_DTYPE, TUNED, Mode, PoseMessage, Request
+from runtime.messages.mode import Mode, Request
+from runtime.messages.motion import PoseMessage
+from runtime.messages.tick import TICK_DTYPE, TUNED
 from runtime.policies import find_policy, load
 from runtime.replay import replay
 from runtime.tuning import POSE, WALKED, Tuning, TuningError, tunables

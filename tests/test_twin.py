@@ -12,7 +12,7 @@ from twin_walk import QUICK
 from drivers.errors import DriverError
 from drivers.robot import JOINTS, LEGS
 from runtime import config
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.modes import Reason
 from sim.build import Build, build_of, lab_build, scrambled
 from sim.mit_emulator import MitEmulator

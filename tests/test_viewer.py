@@ -11,7 +11,7 @@ from scenes import quaternion, robot, rotation
 from walks import Walk
 
 from runtime.control.kinematics import forward, leg_geometry
-from runtime.messages import TICK_DTYPE, tick_schema
+from runtime.messages.tick import TICK_DTYPE, tick_schema
 from runtime.recording import RecordingError, load
 from station import ticks as station_ticks
 from station.canvas import SCENE_HZ, Canvas

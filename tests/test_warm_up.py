@@ -11,7 +11,7 @@ import gc, sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 from walks import Walk
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 
 def forms():
     return {str(d.py_func): len(d.signatures) for d in gc.get_objects() if isinstance(d, Dispatcher)}

@@ -11,7 +11,7 @@ import pytest
 from twin_walk import WireWalk
 
 from runtime import config
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from station.tour import Leg
 from trotd.tour import take_tour
 

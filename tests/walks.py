@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from trotd.bench.outing import Outing as Walk
 
 __all__ = ["Walk", "walk_around"]

@@ -15,7 +15,9 @@ import numpy as np
 from drivers.robot import Array, Robot
 from runtime.config import Config
 from runtime.doors import Channel
-from runtime.messages import ArmingCheck, Keys, SimTruth, decode_hold, decode_push
+from runtime.messages.keys import Keys
+from runtime.messages.mode import ArmingCheck
+from runtime.messages.simulation import SimTruth, decode_hold, decode_push
 
 if TYPE_CHECKING:
     from sim.world import World

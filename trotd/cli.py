@@ -19,7 +19,7 @@ from trotd import cli_bench, cli_hardware, cli_live, cli_ros2, cli_station, cli_
 
 if TYPE_CHECKING:
     from runtime.config import Config
-    from runtime.messages import ModeReply
+    from runtime.messages.mode import ModeReply
 
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")  # before numpy loads: small matrices are 80 times slower on two threads
@@ -182,7 +182,7 @@ def status(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPO
 
 
 def _ask(word: str, robot: str, connect: str) -> ModeReply:
-    from runtime.messages import ModeReply
+    from runtime.messages.mode import ModeReply
     from station.session import connected
 
     config, _ = _load(robot, None, None)
@@ -240,7 +240,7 @@ def faults(
         import msgspec
 
         from runtime.faults import fault_file, load_faults
-        from runtime.messages import FaultRecord
+        from runtime.messages.fault import FaultRecord
         from station.session import connected
 
         config, _ = _load(robot, None, None)

@@ -77,7 +77,7 @@ def _told(station: Station) -> Iterator[None]:
     """What the robot tells about policies meanwhile, on the error stream, behind something that turns."""
     from rich.console import Console
 
-    from runtime.messages import Event
+    from runtime.messages.event import Event
     from station.ticks import hearing
 
     console = Console(stderr=True)

@@ -113,7 +113,7 @@ def monitor(
     from rich.console import Console
 
     from runtime import config
-    from runtime.messages import Event
+    from runtime.messages.event import Event
     from station.monitor import draw_table, watch
     from station.session import connected
 
@@ -178,7 +178,7 @@ def recordings(
 ) -> None:
     """List the robot's recordings, or fetch one over the link."""
     from runtime import config
-    from runtime.messages import RecordingEntry, RecordingReply
+    from runtime.messages.recording import RecordingEntry, RecordingReply
     from station.session import StationError, connected
 
     with refusals():

@@ -22,7 +22,7 @@ from drivers.xbus import Message, Output, XbusParser, encode, encode_outputs
 from runtime import config
 from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle, Wake
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.policies import find_policy, load
 from sim.build import Build, lab_build
 from sim.scenario import Scenario

@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from runtime.config import Config
-from runtime.messages import Status
+from runtime.messages.status import Status
 from station.session import Station, StationError, connected
 from station.tour import Tour, TourReport
 from trotd.wire import MEETING, twin_folder

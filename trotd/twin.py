@@ -23,7 +23,8 @@ from drivers.wiring import MotorsConfig
 from runtime.config import Config
 from runtime.control.posture import Posture
 from runtime.link import session_config
-from runtime.messages import Keys, MessageError
+from runtime.messages.decoding import MessageError
+from runtime.messages.keys import Keys
 from runtime.realtime import settle_garbage
 from sim.build import Build, build_of, lab_build, scrambled
 from sim.scenario import Noise, Scenario

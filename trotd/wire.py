@@ -22,7 +22,7 @@ from drivers.robot import JointCommand, Measurement, Robot
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
 from drivers.xsens import Xsens
 from runtime.config import Config
-from runtime.messages import ArmingCheck
+from runtime.messages.mode import ArmingCheck
 
 TWIN_REPLY_TIME = 0.04
 """How long a twin's replies are waited for, s: its process shares the computer with everybody, and its time with us.

@@ -14,7 +14,7 @@ from faults.rig import Fault, Rig
 from runtime import policies
 from runtime.control.grf import GrfProblem
 from runtime.control.policy import Policy
-from runtime.messages import Request
+from runtime.messages.mode import Request
 
 
 @dataclass

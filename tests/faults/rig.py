@@ -18,7 +18,7 @@ from runtime import config
 from runtime.config import Config
 from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle, Wake
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.policies import find_policy, load
 from sim.scenario import Scenario
 from sim.twin import REAL_NOISE

@@ -20,7 +20,8 @@ import msgspec
 import psutil
 
 from runtime import config
-from runtime.messages import Mode, ModeReply, Request, SimTruth
+from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.simulation import SimTruth
 from station.driving import Driving
 from station.joystick import Joystick
 from station.pad import Sticks

@@ -12,7 +12,7 @@ import numpy as np
 from drivers.robot import motor_torque
 from faults.rig import Rig
 from faults.watch import COMMAND_FIELDS
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 
 LINEAR, YAW_RATE = ((-0.4, 0.8), (-0.3, 0.3)), 0.8
 """m/s forward and sideways, rad/s: what is asked for, at most one of them whole at a time."""

@@ -13,7 +13,7 @@ from drivers.robot import JointCommand, Measurement, motor_torque
 from faults.rig import Rig
 from runtime import modes
 from runtime.config import Config
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 
 COMMAND_FIELDS = ("position", "velocity", "kp", "kd", "torque")
 ANSWER_TICKS = 2

@@ -19,14 +19,14 @@ import numpy as np
 
 from runtime import config
 from runtime.control.records import Records
-from runtime.messages import ModeReply
+from runtime.messages.mode import ModeReply
 from runtime.recording import SUFFIX, load
 from station.session import NoAnswer, Station, StationError, connected
 
 ROBOT = "stoch3"
 PRIORITY = 80
 WALK = 3
-"""``runtime.messages.Mode.WALK``."""
+"""``runtime.messages.mode.Mode.WALK``."""
 PATIENCE = 20.0
 """s for which a refused request is asked again."""
 START = 240.0

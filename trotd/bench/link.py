@@ -31,7 +31,9 @@ from runtime.control.records import Records
 from runtime.cycle import Cycle
 from runtime.doors import Doors
 from runtime.link import Link, session_config
-from runtime.messages import TICK_DTYPE, Mode, Status
+from runtime.messages.mode import Mode
+from runtime.messages.status import Status
+from runtime.messages.tick import TICK_DTYPE
 from runtime.policies import find_policy, load
 from runtime.shelf import PolicyFile
 from runtime.status import build_status

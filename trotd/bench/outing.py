@@ -14,7 +14,7 @@ from runtime.control.policy import encode_policy
 from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle, Wake
 from runtime.flight_log import versions
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.policies import find_policy, load
 from runtime.recorder import Recorder
 from runtime.recording import Header, layout

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from runtime.messages import Mode, Request
+from runtime.messages.mode import Mode, Request
 from runtime.recording import Recording, load
 from runtime.replay import Player, replay
 from trotd.bench.outing import Outing

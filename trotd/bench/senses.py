@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.robot import Array
-from runtime.messages import Request
+from runtime.messages.mode import Request
 from trotd.bench.report import Figure, Finding, shown
 
 Contacts = NDArray[np.bool_]

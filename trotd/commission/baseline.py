@@ -13,7 +13,7 @@ from drivers.commissioning import GRAVITY, CommissionError, contact_baseline
 from runtime.config import Config
 from runtime.control.records import Records
 from runtime.control.state import build_parameters
-from runtime.messages import Mode
+from runtime.messages.mode import Mode
 from station.session import Station
 from station.ticks import TickStream
 

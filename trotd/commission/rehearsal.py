@@ -18,7 +18,8 @@ from drivers.errors import DriverError
 from drivers.robot import JOINTS, LEGS, Array
 from runtime.config import Config
 from runtime.link import session_config
-from runtime.messages import Keys, SimHold, SimTruth
+from runtime.messages.keys import Keys
+from runtime.messages.simulation import SimHold, SimTruth
 from trotd.commission.steps import Task
 
 TILT = 0.5
