@@ -25,7 +25,7 @@ from runtime.config import Config
 from runtime.control.policy import Policy
 from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle, Wake
-from runtime.doors import Channel, Outcome
+from runtime.doors.answers import Channel, Outcome
 from runtime.faults import FaultHistory, fault_file
 from runtime.flight_log import FlightLog
 from runtime.link import Link

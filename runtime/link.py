@@ -20,7 +20,8 @@ import zenoh
 from runtime.access import AccessError, control_access, use_certificates
 from runtime.config import Config
 from runtime.control.records import Records
-from runtime.doors import Channel, Doors, Entrance
+from runtime.doors.answers import Channel, Doors
+from runtime.doors.entrance import Entrance
 from runtime.messages.event import Event
 from runtime.messages.keys import Keys
 from runtime.messages.tick import TICK_DTYPE

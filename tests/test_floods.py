@@ -17,7 +17,7 @@ from daemons import Served, make_config
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.doors import SHED
+from runtime.doors.velocity import SHED
 from runtime.messages.decoding import MessageError
 from runtime.messages.mode import Mode, decode_request
 from runtime.messages.motion import decode_pose, decode_velocity

@@ -20,10 +20,11 @@ from daemons import free_endpoint, make_config, make_policy
 from runtime.config import Config
 from runtime.control.policy import encode_policy
 from runtime.control.records import VelocityCommand
-from runtime.doors import Channel, Outcome
+from runtime.doors.answers import Channel, Doors, Outcome
 from runtime.link import Link, LinkError
 from runtime.messages.decoding import MessageError
 from runtime.messages.event import Event
+from runtime.messages.fault import FaultRecord
 from runtime.messages.mode import ModeReply, Request
 from runtime.messages.motion import PoseMessage
 from runtime.messages.policy import PolicyEntry, PolicyReply
@@ -43,7 +44,7 @@ STATUS = Status(
 
 
 class Desk:
-    """Stands in for the daemon: notes what came through, and on which thread."""
+    """Stands in for the daemon: notes what came through, and on which thread every door was opened."""
 
     def __init__(self, robot: str) -> None:
         self.velocities: list[VelocityCommand] = []
@@ -54,62 +55,58 @@ class Desk:
         self.poses: list[PoseMessage] = []
         policy = make_policy(robot)
         self.file = PolicyFile(policy, encode_policy(policy))
+        for name in (name for name in vars(Doors) if not name.startswith("_")):
+            setattr(self, name, self._noting(getattr(self, name)))
 
-    def _note(self) -> None:
-        self.threads.add(threading.get_ident())
+    def _noting(self, door: Callable[..., Any]) -> Callable[..., Any]:
+        def noting(*args: Any) -> Any:
+            self.threads.add(threading.get_ident())
+            return door(*args)
+
+        return noting
 
     def take_velocity(self, command: VelocityCommand) -> None:
-        self._note()
         self.velocities.append(command)
 
     def take_request(self, wish: Request) -> ModeReply:
-        self._note()
         self.requests.append(wish)
         return ModeReply(wish is not Request.WALK, "DAMP", "because")
 
     def lose_operator(self) -> None:
-        self._note()
         self.lost += 1
 
     def take_pose(self, pose: PoseMessage) -> None:
-        self._note()
         self.poses.append(pose)
 
     def take_tuning(self, change: TuningRequest, done: Future[TuningReply]) -> None:
-        self._note()
         done.set_result(TuningReply(change.name == "swing_time", change.name))
 
     def list_tuning(self) -> list[TuningEntry]:
-        self._note()
         return [TuningEntry("swing_time", "s", 0.2, 0.2, 0.2, 0.1, 0.5, None)]
 
     def offer_policy(self, file: PolicyFile, immediate: bool, done: Future[Outcome]) -> None:
-        self._note()
         self.file = file
         asyncio.get_running_loop().call_later(0.05, done.set_result, Outcome(True, f"immediate: {immediate}", {"a": 1}))
 
     def roll_back(self, done: Future[Outcome]) -> None:
-        self._note()
         raise PolicyError("nothing before")
 
     def list_policies(self) -> Callable[[], list[PolicyEntry]]:
-        self._note()
         return lambda: [PolicyEntry("active", "p", "0", "by hand")]
 
     def refuse(self, door: str, why: str) -> None:
-        self._note()
         self.refused.append((door, why))
 
     def active_policy(self) -> PolicyFile:
-        self._note()
         return self.file
 
+    def fault_history(self) -> list[FaultRecord]:
+        return []
+
     def record_now(self, reason: str, done: Future[Path]) -> None:
-        self._note()
         done.set_result(Path("/there"))
 
     def status(self) -> Status:
-        self._note()
         return STATUS
 
 

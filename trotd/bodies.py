@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.robot import Array, Robot
 from runtime.config import Config
-from runtime.doors import Channel
+from runtime.doors.answers import Channel
 from runtime.messages.keys import Keys
 from runtime.messages.mode import ArmingCheck
 from runtime.messages.simulation import SimTruth, decode_hold, decode_push

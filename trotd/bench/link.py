@@ -29,7 +29,7 @@ from runtime import config
 from runtime.config import Config
 from runtime.control.records import Records
 from runtime.cycle import Cycle
-from runtime.doors import Doors
+from runtime.doors.answers import Doors
 from runtime.link import Link, session_config
 from runtime.messages.mode import Mode
 from runtime.messages.status import Status
