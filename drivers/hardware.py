@@ -17,7 +17,9 @@ from drivers.bus import Bus
 from drivers.can_bus import PythonCanBus
 from drivers.description import RobotDescription
 from drivers.errors import BusTimeout, DriverError, NotConnected
-from drivers.motors import RESTARTED, SILENT, Motors, build_codec
+from drivers.motor_codec import build_codec
+from drivers.motor_faults import RESTARTED, SILENT
+from drivers.motors import Motors
 from drivers.pi3hat import Pi3HatBus
 from drivers.robot import JOINTS, LEGS, Array, ImuSample, JointCommand, Measurement
 from drivers.wiring import BusConfig, MotorsConfig

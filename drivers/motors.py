@@ -9,88 +9,30 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import chain
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.bus import Bus, Frame
 from drivers.errors import CorruptFrame
-from drivers.mit import MitCodec
-from drivers.moteus import MoteusCodec, Reading
+from drivers.moteus import Reading
+from drivers.motor_codec import (
+    MODE,
+    POSITION,
+    TEMPERATURE,
+    TORQUE,
+    VELOCITY,
+    VOLTAGE,
+    MotorCodec,
+    as_array,
+    build_codec,
+)
+from drivers.motor_faults import MotorFaults
 from drivers.robot import JOINTS, LEGS, Array, JointCommand, JointState
 from drivers.wiring import MotorsConfig
 
-
-class MotorCodec(Protocol):
-    """A motors' protocol, sans-I/O; ``MoteusCodec`` and ``MitCodec`` are such."""
-
-    fd: bool
-    running: int
-    starting: tuple[int, ...]
-    latches: frozenset[int]
-    """Fault codes that only say that the motor stopped listening: a stop clears them for good."""
-    command_ids: list[int]
-    reply_ids: list[int]
-    query: list[bytes]
-    stop: list[bytes]
-    enable: list[bytes] | None
-
-    def encode(self, commands: Array) -> list[bytes]:
-        """Frames for position, velocity, torque, kp, kd at the motors (n, 5)."""
-        ...
-
-    def motor_of(self, data: bytes) -> int | None:
-        """The motor that a reply names in its data; None where its arbitration id does."""
-        ...
-
-    def decode(self, data: bytes) -> Reading:
-        """One reply in wire units: mode, position, velocity, torque, voltage, temperature, fault."""
-        ...
-
-    def to_si(self, readings: Array) -> Array:
-        """Rows of ``decode`` in SI units."""
-        ...
-
-    def fault(self, mode: int, fault: int) -> int:
-        """The fault code of a motor that is not running."""
-        ...
-
-    def describe_fault(self, code: int) -> str:
-        """A fault code in words."""
-        ...
-
-
-def build_codec(config: MotorsConfig) -> MotorCodec:
-    """The codec that ``config`` asks for.
-
-    Raises:
-        ValueError: an id, model or bound that the protocol does not have.
-    """
-    ids = [motor for leg in config.id for motor in leg]
-    if config.protocol == "mit":
-        return MitCodec(ids, model=config.model)
-    return MoteusCodec(
-        ids,
-        max_torque=np.tile(np.array(config.max_torque) / config.gear, 4),
-        servo_kp=config.servo_kp,
-        servo_kd=config.servo_kd,
-        watchdog=config.watchdog,
-        form=config.format,
-    )
-
-
-RESTARTED = 16
-"""Fault code of ours: a motor that had been running is back at its beginning. Its zero may be lost."""
-NOT_STARTING = 17
-"""Fault code of ours: a motor that gets commands but does not begin to obey."""
-SILENT = 18
-"""Fault code of ours: a motor missed more replies in a row than are coasted over."""
 _EXTRA_REPLIES = 2
 """One more than asked for may be the wire's doing."""
-START_TIME = 0.25
-"""s that a motor may take from stopped to running."""
 
 
 @dataclass(slots=True)
@@ -115,7 +57,6 @@ class MotorCounters:
 
 
 Purpose = Literal["command", "query", "stop"]
-_MODE, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _TEMPERATURE, _FAULT = range(7)
 
 
 class Motors:
@@ -132,6 +73,7 @@ class Motors:
     ) -> None:
         self.config, self.bus = config, bus
         self.codec = codec or build_codec(config)
+        self._faults = MotorFaults(self.codec, config.coasted_ticks)
         self.counters = MotorCounters()
         self._reply_time, self._clock = reply_time, clock
         self._bus_of = [number - 1 for leg in config.bus for number in leg]
@@ -156,11 +98,8 @@ class Motors:
         self._stamps = [-np.inf] * 12
         self._answered: set[int] = set()
         self._waiting, self._last_sent = False, -np.inf
-        self._running = [False] * 12
-        self._missed = [0] * 12
         self._replies, self._cycles = [0] * 12, 0
-        self._commanding_since: float | None = None
-        self._latched: dict[int, int] = {}
+        self._faults.reset()
 
     async def open(self) -> None:
         """Open the buses.
@@ -180,8 +119,7 @@ class Motors:
 
     async def stop(self) -> None:
         """Take the torque from all motors, which also clears the faults that they hold; ours stay until ``reset``."""
-        self._commanding_since = None
-        self._running = [False] * 12
+        self._faults.end_commands()
         await self._cycle(self._frames["stop"])
 
     async def command(self, command: JointCommand) -> None:
@@ -190,8 +128,8 @@ class Motors:
         Raises:
             ValueError: a number is not finite; nothing was sent.
         """
-        if self._commanding_since is None:
-            self._commanding_since = self._clock()
+        if not self._faults.commanded:
+            self._faults.begin_commands(self._clock())
             if self.codec.enable is not None:
                 await self._cycle(self._addressed(self.codec.enable))
                 return
@@ -201,25 +139,25 @@ class Motors:
         """All motors' newest readings, at the joints."""
         now, si = self._clock(), self._si
         return JointState(
-            position=(si[:, _POSITION] * self._to_joint - self._offset).reshape(4, 3),
-            velocity=(si[:, _VELOCITY] * self._to_joint).reshape(4, 3),
-            torque=(si[:, _TORQUE] * self._torque_to_joint).reshape(4, 3),
-            temperature=si[:, _TEMPERATURE].reshape(4, 3),
-            fault=self._faults(now).reshape(4, 3),
+            position=(si[:, POSITION] * self._to_joint - self._offset).reshape(4, 3),
+            velocity=(si[:, VELOCITY] * self._to_joint).reshape(4, 3),
+            torque=(si[:, TORQUE] * self._torque_to_joint).reshape(4, 3),
+            temperature=si[:, TEMPERATURE].reshape(4, 3),
+            fault=self._faults.judge(self._readings, now).reshape(4, 3),
             age=(now - np.array(self._stamps)).reshape(4, 3),
         )
 
     @property
     def voltage(self) -> float:
         """Lowest supply voltage that a motor reports, V; NaN where none reports one."""
-        volts = self._si[:, _VOLTAGE]
+        volts = self._si[:, VOLTAGE]
         known = volts[np.isfinite(volts)]
         return float(known.min()) if len(known) else float("nan")
 
     @property
     def modes(self) -> list[int]:
         """What mode each motor says it is in."""
-        return [int(reading[_MODE]) for reading in self._readings]
+        return [int(reading[MODE]) for reading in self._readings]
 
     def silent(self, longer_than: float) -> list[int]:
         """Indices of the motors whose last reply is older than that, s."""
@@ -233,7 +171,7 @@ class Motors:
     @property
     def all_silent(self) -> bool:
         """Whether every motor missed more replies in a row than are coasted over."""
-        return min(self._missed) > self.config.coasted_ticks
+        return self._faults.all_silent
 
     def name(self, index: int) -> str:
         """``FL knee (id 13, bus 1)`` for 2."""
@@ -241,13 +179,7 @@ class Motors:
 
     def describe_fault(self, code: int) -> str:
         """A fault code of ``joint_state`` in words."""
-        if code == RESTARTED:
-            return "it restarted by itself: check supply and zero"
-        if code == SILENT:
-            return f"it missed more than {self.config.coasted_ticks} replies in a row: cable? supply?"
-        if code == NOT_STARTING:
-            return f"it gets commands but did not begin to obey within {START_TIME} s"
-        return self.codec.describe_fault(code)
+        return self._faults.describe(code)
 
     async def _cycle(self, frames: Sequence[Frame]) -> None:
         self._answered.clear()
@@ -257,11 +189,8 @@ class Motors:
         await self.bus.cycle(frames, self._reply_time)
         self._waiting = False
         self._si = self.codec.to_si(as_array(self._readings))
-        if len(self._answered) < 12:
-            self.counters.missed += 12 - len(self._answered)
-            self._missed = [0 if i in self._answered else count + 1 for i, count in enumerate(self._missed)]
-        else:
-            self._missed = [0] * 12
+        self.counters.missed += 12 - len(self._answered)
+        self._faults.note_answers(self._answered)
 
     def _receive(self, bus: int, identifier: int, data: bytes) -> bool:
         counters = self.counters
@@ -280,7 +209,7 @@ class Motors:
         if not self._waiting:
             counters.late += 1
             self._stamps[index] = self._last_sent
-            self._missed[index] = 0
+            self._faults.note_late_answer(index)
             return False
         counters.duplicate += index in self._answered
         self._answered.add(index)
@@ -300,37 +229,6 @@ class Motors:
 
     def _addressed(self, data: Sequence[bytes]) -> list[Frame]:
         return list(zip(self._bus_of, self.codec.command_ids, data, strict=True))
-
-    def _faults(self, now: float) -> NDArray[np.int32]:
-        faults = np.zeros(12, dtype=np.int32)
-        running, coasted = self.codec.running, self.config.coasted_ticks
-        for index, reading in enumerate(self._readings):
-            if reading[_MODE] == running and index not in self._latched and self._missed[index] <= coasted:
-                self._running[index] = self._commanding_since is not None
-            else:
-                faults[index] = self._fault(index, int(reading[_MODE]), int(reading[_FAULT]), now)
-        return faults
-
-    def _fault(self, index: int, mode: int, fault: int, now: float) -> int:
-        if index in self._latched:
-            return self._latched[index]
-        if self._missed[index] > self.config.coasted_ticks:
-            return SILENT
-        if mode == self.codec.running:
-            return 0
-        if mode not in self.codec.starting:
-            return self.codec.fault(mode, fault)
-        if self._commanding_since is None:
-            return 0
-        if self._running[index]:
-            self._latched[index] = RESTARTED
-            return RESTARTED
-        return NOT_STARTING if now - self._commanding_since > START_TIME else 0
-
-
-def as_array(readings: Sequence[Reading]) -> Array:
-    """What ``decode`` gave, as ``to_si`` wants it. Shape (n, 7)."""
-    return np.fromiter(chain.from_iterable(readings), np.float64, 7 * len(readings)).reshape(-1, 7)
 
 
 _NOTHING: Reading = (0, float("nan"), float("nan"), float("nan"), float("nan"), float("nan"), 0)

@@ -16,7 +16,7 @@ from drivers.commissioning import LEAST_MOTION, CommissionError, MotorPlace
 from drivers.errors import CorruptFrame
 from drivers.mit import MitCodec
 from drivers.moteus import MoteusCodec, Reading
-from drivers.motors import MotorCodec
+from drivers.motor_codec import MotorCodec
 from drivers.wiring import MotorsConfig
 
 ENOUGH = 0.1

@@ -13,7 +13,7 @@ from drivers.description import RobotDescription
 from drivers.errors import BusTimeout, DriverError, NotConnected
 from drivers.hardware import CLEAR_INTERVAL, HardwareRobot, build_bus
 from drivers.moteus_registers import Mode
-from drivers.motors import RESTARTED
+from drivers.motor_faults import RESTARTED
 from drivers.robot import ImuSample, damp_command
 from drivers.wiring import BusConfig
 from runtime import config

@@ -11,7 +11,8 @@ from bench_robot import DIRECTION, IDS, OFFSET, Bench, command, motors_config
 
 from drivers.bus import Frame, InProcessBus
 from drivers.moteus_registers import Mode
-from drivers.motors import NOT_STARTING, RESTARTED, START_TIME, Motors
+from drivers.motor_faults import NOT_STARTING, RESTARTED, START_TIME
+from drivers.motors import Motors
 from sim.moteus_emulator import REVOLUTION
 
 

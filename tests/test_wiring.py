@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from drivers.hardware import build_bus
-from drivers.motors import build_codec
+from drivers.motor_codec import build_codec
 from runtime import config
 from runtime.config import ROBOTS, ConfigError
 

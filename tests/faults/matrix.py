@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from drivers.moteus_registers import FAULTS
-from drivers.motors import NOT_STARTING, RESTARTED
+from drivers.motor_faults import NOT_STARTING, RESTARTED
 from faults import wire
 from faults.computer import (
     ClockStep,

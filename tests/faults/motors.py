@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from drivers.errors import BusTimeout
-from drivers.motors import RESTARTED, SILENT
+from drivers.motor_faults import RESTARTED, SILENT
 from drivers.robot import JointCommand, Measurement
 from faults.rig import WATCHDOG, WATCHDOG_DAMPING, Fault, Rig
 

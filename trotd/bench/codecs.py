@@ -14,7 +14,8 @@ import numpy as np
 from drivers import xbus
 from drivers.bus import Frame, InProcessBus
 from drivers.hardware import HardwareRobot
-from drivers.motors import Motors, as_array, build_codec
+from drivers.motor_codec import as_array, build_codec
+from drivers.motors import Motors
 from drivers.mtdata2 import Data
 from drivers.robot import ImuSample, JointCommand, damp_command
 from drivers.xbus import Message, XbusParser
