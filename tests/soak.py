@@ -33,6 +33,7 @@ def daemon(
     minutes: Annotated[float, typer.Option(help="How long it walks.")] = 60.0,
     robot: Annotated[str, typer.Option(help="A shipped robot or a .toml file.")] = "stoch3",
     wire: Annotated[bool, typer.Option("--wire", help="On the wire twin, over its buses and its IMU's line.")] = False,
+    watched: Annotated[bool, typer.Option("--watched/--alone", help="With monitor and viewer, or without.")] = True,
     rate_hz: Annotated[float, typer.Option(help="Ticks a second.")] = 200.0,
     json: JsonOption = False,
 ) -> None:
@@ -47,7 +48,7 @@ def daemon(
         def show(words: str) -> None:
             line.update(Text(words, no_wrap=True, overflow="ellipsis"))
 
-        shift = work(minutes, robot, "twin" if wire else "sim", rate_hz, show)
+        shift = work(minutes, robot, "twin" if wire else "sim", rate_hz, watched, show)
     problems = shift.problems(GROWTH)
     if json:
         _print_json({"shift": shift, "problems": problems})

@@ -88,9 +88,9 @@ class Hands:
 
     @property
     def sticks(self) -> Sticks:
-        """Centred for a moment twice a minute, as after every start and loss, else slowly to and fro."""
+        """Centred for a moment every ten seconds, as after every start and loss, else slowly to and fro."""
         t = time.monotonic() - self._start
-        if t % 30.0 < 3.0:
+        if t % 10.0 < 1.5:
             return Sticks(held=True)
         return Sticks(0.3 + 0.3 * math.sin(0.21 * t), 0.3 * math.sin(0.37 * t), 0.4 * math.sin(0.13 * t), True)
 
@@ -104,8 +104,8 @@ def resident(process: psutil.Process) -> float:
     return float(process.memory_info().rss) / 2**20
 
 
-def work(minutes: float, robot: str, body: str, rate_hz: float, show: Callable[[str], None]) -> Shift:
-    """One shift on the simulator (``sim``) or on the wires of its twin (``twin``).
+def work(minutes: float, robot: str, body: str, rate_hz: float, watched: bool, show: Callable[[str], None]) -> Shift:
+    """One shift on the simulator (``sim``) or on the wires of its twin (``twin``), ``watched`` by everybody or alone.
 
     Raises:
         StationError: the daemon does not start.
@@ -121,9 +121,10 @@ def work(minutes: float, robot: str, body: str, rate_hz: float, show: Callable[[
         daemon = stack.enter_context(_process(folder, "daemon", command))
         station = stack.enter_context(_reached(robot, endpoint, daemon))
         _stand_and_walk(station)
+        watchers = (["monitor", "--json", "--hz", "2"], ["view", "--save", os.devnull]) if watched else ()
         clients = {
             words[0]: stack.enter_context(_process(folder, words[0], [*words, "--robot", robot, "--connect", endpoint]))
-            for words in (["monitor", "--json", "--hz", "2"], ["view", "--save", os.devnull])
+            for words in watchers
         }
         _drive(station, daemon, shift, show)
         for name, client in clients.items():
