@@ -11,25 +11,20 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from drivers.robot import Array, JointCommand, Measurement
 from runtime import keyframe, modes
 from runtime.arming import Arming
 from runtime.config import Config
 from runtime.control.controller import Controller, alike
 from runtime.control.policy import Policy
-from runtime.control.records import CONTROL_DTYPE, Clamp, Records, SolverStatus, VelocityCommand
+from runtime.control.records import Clamp, Records, SolverStatus, VelocityCommand
 from runtime.guard import Guard
-from runtime.keyframe import KEYFRAME_DTYPE
 from runtime.messages.event import Event
 from runtime.messages.fault import Evidence
 from runtime.messages.mode import ArmingCheck, Mode, Request
-from runtime.messages.tick import CONTROL_OFFSET, TICK_DTYPE, TUNED
 from runtime.modes import Answer, ModeState, Reaction, Reason
-from runtime.sources import COMMAND_FIELDS, Sources
-
-__all__ = ["EVENTS", "KEYFRAME_DTYPE", "Cycle", "Fault", "Wake"]
+from runtime.sources import Sources
+from runtime.tick_record import TickRecord, Wake
 
 STILL = 0.15
 """m/s: a robot that stands and is no faster may sit down."""
@@ -41,23 +36,6 @@ _OK, _SOLVER_FAILED, _OPERATOR_LOST = Reason.OK, Reason.SOLVER_FAILED, Reason.OP
 _UPRIGHT = (_STAND, _WALK)
 _FAILED = int(SolverStatus.FAILED)
 _DEADMAN = int(Clamp.DEADMAN)
-_PLAN_FIELDS = ("velocity_command", "observation", "asked", "action", "phase", "stance", "touchdown", "foot_targets")
-_BLANK_FIELDS = (*_PLAN_FIELDS, "target_wrench", "grf", "solver_status", "clamps")
-
-
-@dataclass(frozen=True, slots=True)
-class Wake:
-    """What the ticker says of the tick that begins."""
-
-    index: int
-    stamp: float
-    """s monotonic."""
-    elapsed: float
-    """Since the tick before, s."""
-    lateness: float
-    """s."""
-    overruns: int
-    """Since the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +59,8 @@ class Cycle:
             ValueError: a pose or a solver that cannot be.
         """
         self.config = config
-        self.tick = np.zeros(1, TICK_DTYPE)
+        self._record = TickRecord()
+        self.tick = self._record.tick
         """The record of this tick. Shape (1,)."""
         self.state = ModeState()
         self.verdict = Reason.NOT_READY
@@ -104,8 +83,7 @@ class Cycle:
         """The arming list of the last request to arm."""
         self.outside: Callable[[], Sequence[ArmingCheck]] = tuple
         """Checks of the arming list that only the shell can make."""
-        control = self.tick.view(np.uint8)[CONTROL_OFFSET:].view(CONTROL_DTYPE)
-        self.controller = Controller(config.robot, config.control, policy, control)
+        self.controller = Controller(config.robot, config.control, policy, self._record.control)
         self.sources = Sources(config, self.controller)
         self.guard = Guard(
             config.robot,
@@ -119,10 +97,7 @@ class Cycle:
         self.arming = Arming(
             config.robot, config.limits, config.arming, (posture.folded_joints, posture.standing_joints)
         )
-        self._row = self.tick[0]  # a view: what is written into it is in the record
-        self._views = {name: self.tick[name][0] for name in TICK_DTYPE.names or () if self.tick[name].ndim > 1}
-        self._tuned = self.tick.view(np.float64)[TUNED]
-        self._command_views = tuple(self._views[f"command_{name}"] for name in COMMAND_FIELDS)
+        self._row, self._views = self._record.row, self._record.views
 
     @property
     def policy(self) -> Policy:
@@ -179,7 +154,7 @@ class Cycle:
     def step(self, wake: Wake, measurement: Measurement) -> JointCommand:
         """From a measurement to the command that acts from the next exchange on."""
         self._begin(wake)
-        self._note_measurement(measurement)
+        self._record.write_measurement(measurement)
         self.verdict = verdict = self.guard.judge(self.tick)
         carried = self.guard.carried_imu()
         if carried is not None:
@@ -205,7 +180,7 @@ class Cycle:
         self.guard.skip()
         self.sources.marks = 0
         command = self.sources.limp()
-        self._write(command)
+        self._record.write_command(command)
         self._note_command(command)
         return command
 
@@ -278,31 +253,13 @@ class Cycle:
         return speed < STILL and bool(self._views["stance"].all())
 
     def _begin(self, wake: Wake) -> None:
-        row = self._row
-        row["index"], row["stamp"], row["period"] = wake.index, wake.stamp, wake.elapsed
-        row["lateness"], row["overruns"], row["policy"] = wake.lateness, wake.overruns, self.generation
-        row["clamps"], row["outgoing"] = 0, self.outgoing
-        self._tuned[:] = self.controller.tuning
-
-    def _note_measurement(self, measurement: Measurement) -> None:
-        row, views = self._row, self._views
-        imu, joints = measurement.imu, measurement.joints
-        row["measured_stamp"], row["imu_stamp"], row["voltage"] = measurement.stamp, imu.stamp, measurement.voltage
-        views["orientation"][:] = imu.orientation
-        views["angular_velocity"][:] = imu.angular_velocity
-        views["linear_acceleration"][:] = imu.linear_acceleration
-        views["joint_position"][:] = joints.position
-        views["joint_velocity"][:] = joints.velocity
-        views["joint_torque"][:] = joints.torque
-        views["joint_temperature"][:] = joints.temperature
-        views["joint_fault"][:] = joints.fault
-        views["joint_age"][:] = joints.age
+        self._record.begin(wake, self.generation, self.outgoing, self.controller.tuning)
 
     def _bounded(self, command: JointCommand, measurement: Measurement) -> JointCommand:
         """The command with its torque cut; or, when it cannot be trusted, one that gives up."""
         mode = self.state.mode
         if mode is _DAMP:
-            self._write(command)
+            self._record.write_command(command)
             return command
         reason = _OK
         if mode is _STAND or mode is _WALK:
@@ -312,11 +269,11 @@ class Cycle:
             if reason is _OK and status == _FAILED:
                 reason = _SOLVER_FAILED
         if reason is _OK:
-            self._write(command)
+            self._record.write_command(command)
             reason = self.guard.bound(self.tick)
         if reason is not _OK:
             return self._give_up(reason, measurement)
-        return JointCommand(command.position, command.velocity, command.kp, command.kd, self._command_views[4].copy())
+        return self._record.bounded(command)
 
     def _give_up(self, reason: Reason, measurement: Measurement) -> JointCommand:
         """Sit down instead of the command that cannot be trusted, or damp."""
@@ -324,20 +281,14 @@ class Cycle:
         sources = self.sources
         if self.state.mode is _SIT_DOWN:
             command = sources.step(_SIT_DOWN, 0.0, measurement, False, 1.0)
-            self._write(command)
+            self._record.write_command(command)
             reason = self.guard.bound(self.tick)
             if reason is _OK:
-                torque = self._command_views[4].copy()
-                return JointCommand(command.position, command.velocity, command.kp, command.kd, torque)
+                return self._record.bounded(command)
             self._damp_for(reason)
         command = sources.limp()
-        self._write(command)
+        self._record.write_command(command)
         return command
-
-    def _write(self, command: JointCommand) -> None:
-        position, velocity, kp, kd, torque = self._command_views
-        position[:], velocity[:], kp[:] = command.position, command.velocity, command.kp
-        kd[:], torque[:] = command.kd, command.torque
 
     def _note_command(self, command: JointCommand) -> None:
         row, state, sources = self._row, self.state, self.sources
@@ -397,8 +348,7 @@ class Cycle:
         state = self.state
         if state.mode is not before.mode:
             self.note("mode", f"{before.mode.name} -> {state.mode.name}: {state.reason.words}")
-            for name in _BLANK_FIELDS:
-                self.tick[name] = 0
+            self._record.blank_plan()
             now = float(self._row["stamp"])
             self.sources.change(before.mode, state.mode, measurement, state.reason.is_fault, now)
         elif state.armed != before.armed or state.fault is not before.fault:

@@ -24,7 +24,7 @@ from runtime.audition import Answer, Audition
 from runtime.config import Config
 from runtime.control.policy import Policy
 from runtime.control.records import VelocityCommand
-from runtime.cycle import Cycle, Wake
+from runtime.cycle import Cycle
 from runtime.doors.answers import Channel, Outcome
 from runtime.faults import FaultHistory, fault_file
 from runtime.flight_log import FlightLog
@@ -40,6 +40,7 @@ from runtime.modes import Reason
 from runtime.shelf import PolicyFile, Shelf
 from runtime.status import build_status
 from runtime.systemd import Notifier
+from runtime.tick_record import Wake
 from runtime.ticker import Ticker
 from runtime.tuning import Tuning, TuningError
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from runtime.control.records import Records
-from runtime.cycle import KEYFRAME_DTYPE
+from runtime.keyframe import KEYFRAME_DTYPE
 from runtime.messages.event import Event
 from runtime.messages.tick import TICK_DTYPE
 from runtime.recording import SUFFIX, Header, prune, save

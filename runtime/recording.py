@@ -59,7 +59,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     itemsize: int
     events: list[Event]
     keyframes: list[bytes] = []
-    """Records of ``runtime.cycle.KEYFRAME_DTYPE``, raw: what a replay begins from."""
+    """Records of ``runtime.keyframe.KEYFRAME_DTYPE``, raw: what a replay begins from."""
     policies: dict[int, str] = {}
     """Files of all policies that these ticks may have used, by generation; without the active one."""
 

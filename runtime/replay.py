@@ -17,11 +17,13 @@ from drivers.robot import ImuSample, JointState, Measurement
 from runtime import config, policies
 from runtime.control.policy import Policy
 from runtime.control.records import COMMAND_FIELDS, ESTIMATE_FIELDS, FEET_FIELDS, Clamp, Records, VelocityCommand
-from runtime.cycle import KEYFRAME_DTYPE, Cycle, Wake
+from runtime.cycle import Cycle
+from runtime.keyframe import KEYFRAME_DTYPE
 from runtime.messages.mode import Mode, Request
 from runtime.messages.tick import TICK_DTYPE, TUNED
 from runtime.modes import Reason
 from runtime.recording import Recording, RecordingError
+from runtime.tick_record import Wake
 
 STAGES: dict[str, tuple[str, ...]] = {
     "mode": ("mode", "armed", "reason", "policy", "asked_velocity"),

@@ -22,9 +22,9 @@ from runtime import config, policies
 from runtime.config import ROBOTS, Config
 from runtime.control.policy import Policy
 from runtime.control.posture import Posture
-from runtime.cycle import Wake
 from runtime.daemon import Daemon, Job
 from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.tick_record import Wake
 from station.session import Station, StationError, connected
 
 _numbers = itertools.count()

@@ -21,9 +21,10 @@ from drivers.robot import Array, ImuSample, JointCommand, Measurement, damp_comm
 from drivers.xbus import Message, Output, XbusParser, encode, encode_outputs
 from runtime import config
 from runtime.control.records import VelocityCommand
-from runtime.cycle import Cycle, Wake
+from runtime.cycle import Cycle
 from runtime.messages.mode import Mode, Request
 from runtime.policies import find_policy, load
+from runtime.tick_record import Wake
 from sim.build import Build, lab_build
 from sim.scenario import Scenario
 from sim.twin import RATE_HZ, REAL_NOISE, TwinBody, TwinSetup

@@ -17,9 +17,10 @@ from drivers.robot import JointCommand, Measurement, damp_command
 from runtime import config
 from runtime.config import Config
 from runtime.control.records import VelocityCommand
-from runtime.cycle import Cycle, Wake
+from runtime.cycle import Cycle
 from runtime.messages.mode import Mode, Request
 from runtime.policies import find_policy, load
+from runtime.tick_record import Wake
 from sim.scenario import Scenario
 from sim.twin import REAL_NOISE
 from sim.world import World

@@ -12,12 +12,13 @@ from drivers.robot import damp_command
 from runtime import config
 from runtime.control.policy import encode_policy
 from runtime.control.records import VelocityCommand
-from runtime.cycle import Cycle, Wake
+from runtime.cycle import Cycle
 from runtime.flight_log import versions
 from runtime.messages.mode import Mode, Request
 from runtime.policies import find_policy, load
 from runtime.recorder import Recorder
 from runtime.recording import Header, layout
+from runtime.tick_record import Wake
 
 LIES_DOWN = 1.2
 """s until a robot that was set down lies still."""
