@@ -8,7 +8,6 @@ on trial, a rise of tilt, of the height's error, of the clamps or of the failed 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -17,17 +16,16 @@ import numpy as np
 
 from runtime.control.controller import alike
 from runtime.control.policy import policy_record
-from runtime.control.records import CONTROL_DTYPE, Clamp, SolverStatus
+from runtime.control.records import CONTROL_DTYPE
 from runtime.control.shadow import SUMS_DTYPE, shadow
 from runtime.control.state import STATE_DTYPE
 from runtime.cycle import Cycle
 from runtime.messages.mode import Mode
 from runtime.parameters import AuditionConfig
 from runtime.policies import PolicyError
+from runtime.proving import Baseline, Watch, describe, object_to_shadow, read_shadow
 from runtime.shelf import PolicyFile, Shelf
 
-TROUBLE = int(Clamp.SHIFT | Clamp.WRENCH | Clamp.REACH | Clamp.JOINT_LIMIT | Clamp.TORQUE)
-"""Clamps that tell of a policy that asks too much."""
 _RUNNING = (int(Mode.STAND), int(Mode.WALK))
 
 
@@ -42,7 +40,7 @@ class Stage(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Outcome:
     """What became of a candidate."""
 
     accepted: bool
@@ -51,19 +49,7 @@ class Verdict:
     """What the shadow found; empty without one."""
 
 
-Answer = Callable[[Verdict], None]
-
-
-@dataclass(slots=True)
-class Baseline:
-    """What the active policy was like before: what a trial is held against."""
-
-    tilt: float = 0.0
-    height: float = 0.0
-    clamped: float = 0.0
-    fell_back: float = 0.0
-    mode: int = -1
-    """In which it was seen; -1 in none."""
+Answer = Callable[[Outcome], None]
 
 
 class Audition:
@@ -82,7 +68,6 @@ class Audition:
         self._share_step = 0.0
         self._stance = np.zeros(4)
         self._baseline = Baseline()
-        self._clamped = self._fell_back = 0.0
         self._candidate: PolicyFile
         self._good: PolicyFile
         self._report: dict[str, float] = {}
@@ -106,7 +91,7 @@ class Audition:
         Args:
             candidate: the policy and its bytes.
             immediate: no shadow, and an answer as soon as it is active; for simulated bodies.
-            answer: gets the verdict.
+            answer: gets the outcome.
 
         Raises:
             PolicyError: not now.
@@ -122,7 +107,7 @@ class Audition:
         if mode is Mode.WALK and not alike(self._cycle.policy, candidate.policy):
             raise PolicyError("it differs in reading or output from the active policy: only while standing")
         if candidate.sha256 == self._shelf.active.sha256:
-            answer(Verdict(True, "already active", {}))
+            answer(Outcome(True, "already active", {}))
             return
         if self.stage is None:
             self._good = self._shelf.active
@@ -149,7 +134,7 @@ class Audition:
         """
         if self.stage in (Stage.TRIAL, Stage.STOOD):
             self._go_back("rolled back")
-            answer(Verdict(True, "rolled back", {}))
+            answer(Outcome(True, "rolled back", {}))
             return
         good = self._shelf.last_good()
         if good is None:
@@ -212,37 +197,16 @@ class Audition:
 
     def _judge_shadow(self, mode: int) -> None:
         """What it would have done is told; what would have been no good is refused."""
-        total, config = self._sums[0], self._config
-        ticks = float(total["ticks"])
-        size = math.sqrt(float(total["active"]) * float(total["candidate"]))
-        agreement = float(total["along"]) / size if size > 0.0 else 0.0
-        before, now = float(total["clamped_active"]) / ticks, float(total["clamped_candidate"]) / ticks
-        self._baseline = Baseline(
-            float(total["tilt"]), float(total["height"]), before, float(total["fell_back"]) / ticks, mode
-        )
-        self._report = {
-            "ticks": ticks,
-            "shift": math.sqrt(float(total["shift"]) / ticks),
-            "force": math.sqrt(float(total["force"]) / ticks),
-            "moment": math.sqrt(float(total["moment"]) / ticks),
-            "agreement": agreement,
-            "clamped_before": before,
-            "clamped_now": now,
-        }
+        total = self._sums[0]
+        self._baseline, self._report = read_shadow(total, mode)
         comparable = alike(self._cycle.policy, self._candidate.policy) and self._candidate.policy.output == "wrench"
-        if total["not_finite"]:
-            self._refuse(f"in shadow it answered with no number in {int(total['not_finite'])} ticks")
-        elif now > before + config.clamp_rise:
-            self._refuse(f"in shadow it was at its bounds in {now:.0%} of the ticks, the active one in {before:.0%}")
-        elif comparable and size > 0.0 and agreement < config.min_agreement:
-            self._refuse(
-                f"in shadow it asked for the opposite of the active one: agreement {agreement:+.2f},"
-                f" bound {config.min_agreement:g}"
-            )
-        else:
-            self._cycle.note("policy", f"{self._candidate.policy.name}: {describe(self._report)}")
-            self._enter(Stage.SUPPORT)
-            self._stance[:] = self._cycle.tick["stance"][0]
+        objection = object_to_shadow(total, self._report, comparable, self._config)
+        if objection:
+            self._refuse(objection)
+            return
+        self._cycle.note("policy", f"{self._candidate.policy.name}: {describe(self._report)}")
+        self._enter(Stage.SUPPORT)
+        self._stance[:] = self._cycle.tick["stance"][0]
 
     def _supported(self, row: np.void) -> bool:
         """On four feet, or in the tick in which the legs change: a swing begins where another one has ended."""
@@ -264,7 +228,8 @@ class Audition:
     def _activate(self, share: float) -> None:
         self._shelf.activate(self._candidate, share)
         self._enter(Stage.TRIAL)
-        self._walked = self._clamped = self._fell_back = 0.0
+        self._walked = 0.0
+        self._trial = Watch(self._baseline, self._config, self._dt)
 
     def _blend(self) -> float:
         """Move the share on by one tick; returns it."""
@@ -284,7 +249,7 @@ class Audition:
         walking = int(row["mode"]) == int(Mode.WALK)
         self._seconds += self._dt
         self._walked += self._dt if walking else 0.0
-        trouble = self._trouble(row, walking)
+        trouble = self._trial.trouble(row, walking, self._seconds)
         if trouble:
             self._go_back(trouble)
         elif self._walked >= self._config.trial:
@@ -296,27 +261,6 @@ class Audition:
             self._reply(
                 True, f"proved while standing; kept for the next start once it has walked for {self._config.trial:g} s"
             )
-
-    def _trouble(self, row: np.void, walking: bool) -> str:
-        """What has risen beyond what the policy before was like; empty when nothing has."""
-        base, config = self._baseline, self._config
-        known = base.mode == int(row["mode"])
-        follow = self._dt / config.window
-        self._clamped += ((int(row["clamps"]) & TROUBLE != 0) - self._clamped) * follow
-        self._fell_back += ((int(row["solver_status"]) > int(SolverStatus.SOLVED)) - self._fell_back) * follow
-        slack = 1.0 if known or not walking else 2.0  # nothing to hold the first walk against
-        pose = row["tuned_body_pose"]
-        tilt = float(np.abs(row["rpy"][:2] - pose[:2] + config.tilt_ahead * row["twist"][3:5]).max())
-        height = abs(float(row["height"] - row["tuned_walking_height"] - pose[3]))
-        for name, value, before, rise, unit in (
-            ("foreseen tilt", tilt, base.tilt, slack * config.tilt_rise, " rad"),
-            ("error of the height", height, base.height, slack * config.height_rise, " m"),
-            ("share of clamped ticks", self._clamped, base.clamped, slack * config.clamp_rise, ""),
-            ("share of ticks without the first solver", self._fell_back, base.fell_back, config.fallback_rise, ""),
-        ):
-            if value > before + rise:
-                return f"{name} {value:.2f}{unit} after {self._seconds:.2f} s, bound {before + rise:.2f}{unit}"
-        return ""
 
     def _interrupted(self) -> None:
         """The robot does not run a policy now: by a fault, that is the candidate's; else the trial waits."""
@@ -336,7 +280,7 @@ class Audition:
             if problem:
                 self._cycle.note("policy", f"{candidate.policy.name}: {problem}")
             if answer is not None:
-                answer(Verdict(True, f"{words}, {problem or 'kept'}", report))
+                answer(Outcome(True, f"{words}, {problem or 'kept'}", report))
 
         self._shelf.keep(candidate, kept)
 
@@ -359,16 +303,4 @@ class Audition:
     def _reply(self, accepted: bool, words: str) -> None:
         answer, self._answer = self._answer, None
         if answer is not None:
-            answer(Verdict(accepted, words, self._report))
-
-
-def describe(report: dict[str, float]) -> str:
-    """What a shadow found, in one line."""
-    if not report:
-        return "not shadowed"
-    return (
-        f"in shadow over {report['ticks']:.0f} ticks it differs by {report['shift'] * 1e3:.1f} mm,"
-        f" {report['force']:.1f} N and {report['moment']:.1f} N·m (root mean square),"
-        f" agreement {report['agreement']:+.2f},"
-        f" at its bounds in {report['clamped_now']:.0%} of them against {report['clamped_before']:.0%}"
-    )
+            answer(Outcome(accepted, words, self._report))

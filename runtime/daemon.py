@@ -8,24 +8,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from drivers.errors import BusTimeout, CorruptFrame, DriverError
+from drivers.errors import BusTimeout, CorruptFrame
 from drivers.robot import Measurement, Robot, damp_command
 from runtime import policies, realtime, state
-from runtime.audition import Answer, Audition
+from runtime.audition import Audition, Outcome
 from runtime.config import Config
 from runtime.control.policy import Policy
 from runtime.control.records import VelocityCommand
 from runtime.cycle import Cycle
-from runtime.doors.answers import Channel, Outcome
+from runtime.doors.answers import Channel
 from runtime.faults import FaultHistory, fault_file
 from runtime.flight_log import FlightLog
 from runtime.link import Link
@@ -39,15 +38,13 @@ from runtime.messages.tuning import TuningEntry, TuningReply, TuningRequest
 from runtime.modes import Reason
 from runtime.shelf import PolicyFile, Shelf
 from runtime.status import build_status
+from runtime.stopping import damp, stopped_by_signals
 from runtime.systemd import Notifier
 from runtime.tick_record import Wake
 from runtime.ticker import Ticker
 from runtime.tuning import Tuning, TuningError
 
 log = logging.getLogger("trotd")
-
-DAMP_REPLIES = 3
-"""Exchanges that must come back before a stopping daemon believes that the body damps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +102,7 @@ class Daemon:
         self._stop = asyncio.Event()
         notifier = Notifier()
         alone = state.lock(self.job.folder, self.config.robot.name)
-        with alone, contextlib.closing(notifier), self._signals(), self.flight.open():
+        with alone, contextlib.closing(notifier), stopped_by_signals(self._stop), self.flight.open():
             async with self._connected(), self._linked():
                 await self._serve(notifier)
 
@@ -144,31 +141,6 @@ class Daemon:
             yield
         finally:
             self.link.close()
-
-    @contextlib.contextmanager
-    def _signals(self) -> Iterator[None]:
-        """SIGTERM and SIGINT stop; a second one cancels whatever the stop waits for."""
-        loop = asyncio.get_running_loop()
-        task = asyncio.current_task()
-        assert task is not None
-
-        def stop(name: str) -> None:
-            assert self._stop is not None
-            if self._stop.is_set():
-                log.warning("%s again: not waiting any longer", name)
-                task.cancel()
-            else:
-                log.info("%s: stopping", name)
-                self._stop.set()
-
-        caught = (signal.SIGTERM, signal.SIGINT)
-        for number in caught:
-            loop.add_signal_handler(number, stop, number.name)
-        try:
-            yield
-        finally:
-            for number in caught:
-                loop.remove_signal_handler(number)
 
     async def _serve(self, notifier: Notifier) -> None:
         for granted in realtime.apply(self.config.realtime):
@@ -226,25 +198,10 @@ class Daemon:
                     notifier.tell("WATCHDOG=1")
 
     async def _damp_body(self) -> None:
-        """Ask the body to damp, once, until it has answered a few times or the deadline is up. Never raises."""
-        if self._damped:
-            return
-        self._damped = True
-        config = self.config.damp
-        command = damp_command(config.kd)
-        replies = 0
-        period = 1.0 / self.config.control.rate_hz
-        with contextlib.suppress(asyncio.CancelledError, TimeoutError):
-            async with asyncio.timeout(config.deadline):
-                while replies < DAMP_REPLIES:
-                    try:
-                        await self.job.body.exchange(command)
-                        replies += 1
-                    except DriverError as error:
-                        log.error("while damping: %s", error)
-                    await asyncio.sleep(period)
-        if replies == 0:
-            log.error("the body did not confirm that it damps; its own watchdog has to")
+        """Ask the body to damp, once. Never raises."""
+        if not self._damped:
+            self._damped = True
+            await damp(self.job.body, self.config.damp, 1.0 / self.config.control.rate_hz)
 
     def _finish(self) -> None:
         """The loop is over: say so, keep the recording."""
@@ -303,7 +260,7 @@ class Daemon:
         """
         if immediate and not self.job.simulated:
             raise policies.PolicyError("immediate is for simulated bodies: a robot shadows first")
-        self.audition.offer(file, immediate, _settle(done))
+        self.audition.offer(file, immediate, done.set_result)
 
     def roll_back(self, done: Future[Outcome]) -> None:
         """Return to the last good policy.
@@ -311,7 +268,7 @@ class Daemon:
         Raises:
             PolicyError: there is none, or not now.
         """
-        self.audition.roll_back(_settle(done))
+        self.audition.roll_back(done.set_result)
 
     def active_policy(self) -> PolicyFile:
         """The active policy and its file."""
@@ -382,10 +339,6 @@ class Daemon:
         if needed and not drivers:
             words = "no driver is there, and arming.require_driver asks for one: trotd joystick"
         return (ArmingCheck("operator", bool(drivers) or not needed, words), *self.job.checks())
-
-
-def _settle(done: Future[Outcome]) -> Answer:
-    return lambda verdict: done.set_result(Outcome(verdict.accepted, verdict.words, verdict.report))
 
 
 def main(job: Job) -> Daemon:

@@ -11,7 +11,7 @@ import pytest
 from walks import Walk
 
 from runtime import policies, recording
-from runtime.audition import Audition, Stage, Verdict
+from runtime.audition import Audition, Outcome, Stage
 from runtime.control.policy import Policy, encode_policy
 from runtime.messages.mode import Mode, Request
 from runtime.policies import PolicyError, check_manifest, find_policy, load
@@ -56,7 +56,7 @@ class Trial:
         config = msgspec.structs.replace(walk.config.audition, shadow=0.5, trial=1.5, **changes)
         self.audition = Audition(walk.cycle, self.shelf, config)
         self.audition.warm_up()
-        self.verdicts: list[Verdict] = []
+        self.verdicts: list[Outcome] = []
         self.tilt = 0.0
         walk.after = self._after
 

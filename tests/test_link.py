@@ -17,10 +17,11 @@ import pytest
 import zenoh
 from daemons import free_endpoint, make_config, make_policy
 
+from runtime.audition import Outcome
 from runtime.config import Config
 from runtime.control.policy import encode_policy
 from runtime.control.records import VelocityCommand
-from runtime.doors.answers import Channel, Doors, Outcome
+from runtime.doors.answers import Channel, Doors
 from runtime.link import Link, LinkError
 from runtime.messages.decoding import MessageError
 from runtime.messages.event import Event

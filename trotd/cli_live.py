@@ -48,7 +48,7 @@ def push(
     """
     import msgspec
 
-    from runtime.audition import describe
+    from runtime.proving import describe
     from station.push import active, roll_back
     from station.push import push as send
     from station.session import StationError

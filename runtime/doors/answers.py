@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from runtime.audition import Outcome
 from runtime.control.records import VelocityCommand
 from runtime.messages.fault import FaultRecord
 from runtime.messages.mode import ModeReply, Request
@@ -16,15 +17,6 @@ from runtime.messages.policy import PolicyEntry
 from runtime.messages.status import Status
 from runtime.messages.tuning import TuningEntry, TuningReply, TuningRequest
 from runtime.shelf import PolicyFile
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of a policy that was sent."""
-
-    accepted: bool
-    words: str
-    report: dict[str, float]
 
 
 class Doors(Protocol):

@@ -8,8 +8,9 @@ import msgspec
 import zenoh
 
 from runtime import policies
+from runtime.audition import Outcome
 from runtime.config import Config
-from runtime.doors.answers import Doors, Outcome
+from runtime.doors.answers import Doors
 from runtime.doors.crossing import Crossing, read_query
 from runtime.messages.policy import PolicyReply
 from runtime.shelf import PolicyFile
