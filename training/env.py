@@ -19,6 +19,7 @@ from runtime.control.controller import Controller
 from runtime.control.policy import set_parameters
 from runtime.control.records import SolverStatus, VelocityCommand
 from sim.world import World
+from training.plan import PHYSICS_RATE_HZ
 from training.randomize import TASK, Randomization, draw
 from training.reward import TASK_TERMS, TaskReward, named
 from training.rollout import LOWEST, standing_command
@@ -42,7 +43,7 @@ class WalkEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         ticks: int = 520,
         reward: TaskReward | None = None,
         terms: bool = True,
-        physics_rate_hz: float = 600.0,
+        physics_rate_hz: float = PHYSICS_RATE_HZ,
     ) -> None:
         """Build one robot in its own simulator.
 

@@ -10,6 +10,8 @@ from msgspec import Meta
 from drivers.description import Name, NonNegative, Positive, Record
 
 Count = Annotated[int, Meta(ge=1)]
+PHYSICS_RATE_HZ = 600.0
+"""Of the simulator that trains; what judges runs at the world's own 1000 (decision 9)."""
 
 
 class StagePlan(Record, frozen=True, kw_only=True):
@@ -45,8 +47,7 @@ class RunPlan(Record, frozen=True, kw_only=True):
     terms: bool = True
     """The fixed terms around the matrix (method: Past the teacher); off is the paper's letter."""
     reference: Literal["rigid-body", "robot"] = "rigid-body"
-    physics_rate_hz: Positive = 600.0
-    """Of the training's simulator; validation runs at 1000."""
+    physics_rate_hz: Positive = PHYSICS_RATE_HZ
     start: str = ""
     """Policy file whose numbers are the first mean; empty starts from zero."""
     stages: tuple[StagePlan, ...]

@@ -19,8 +19,8 @@ from training.randomize import SENSORS, TASK, Conditions, draw
 
 CANDIDATES = 4
 """Checkpoints that are compared: the last ones, evenly spread over the last stage."""
-SEED = 5_000
-"""Of the validation set; apart from training's and from the table's."""
+VALIDATION_SEED = 5_000
+"""Of the episodes that judge; apart from training's and from the table's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +42,12 @@ class Verdict:
 def validation_set(draws: int = 24) -> tuple[list[Trial], list[Trial]]:
     """Velocities that are measured, and pushes, spawns and draws that are to be survived."""
     commands = ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (-0.4, 0.0, 0.0), (1.6, 0.0, 0.0), (0.0, 0.3, 0.0), (0.5, 0.0, 0.5))
-    measured = [Trial(Conditions(Scenario(seed=SEED, noise=SENSORS), command), 5.0) for command in commands]
+    measured = [Trial(Conditions(Scenario(seed=VALIDATION_SEED, noise=SENSORS), command), 5.0) for command in commands]
     pushed = [
         Trial(
             Conditions(
                 Scenario(
-                    seed=SEED + phase,
+                    seed=VALIDATION_SEED + phase,
                     noise=SENSORS,
                     pushes=(Push(1.6 + 0.1 * phase, 0.1, (450.0 * np.cos(side), 450.0 * np.sin(side), 0.0)),),
                 ),
@@ -58,7 +58,7 @@ def validation_set(draws: int = 24) -> tuple[list[Trial], list[Trial]]:
         for phase in range(4)
         for side in (0.0, pi / 2, pi, -pi / 2)
     ]
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(VALIDATION_SEED)
     return measured, pushed + [Trial(draw(TASK, rng), 2.6) for _ in range(draws)]
 
 

@@ -17,23 +17,20 @@ from runtime.control.policy import Policy
 from sim.scenario import Scenario
 from training.checkpoint import RunFolder
 from training.mpc_controller import MpcController
-from training.plan import IMITATE, RunPlan, StagePlan
+from training.plan import IMITATE, PHYSICS_RATE_HZ, RunPlan, StagePlan
 from training.provenance import config_hash, versions
 from training.randomize import NOISY, SENSORS, Conditions, draw
 from training.reference import Reference
 from training.reward import TableReward
 from training.rollout import Setup, Stage, Task
+from training.selection import VALIDATION_SEED
 from training.trainer import MakeEvaluator, Report, Trainer
 from training.variants import Variant, make_policy
 
-SEED = 5_000
-"""Of the episodes that judge; no training iteration draws from it."""
 DRAWS = 8
 """Episodes that judge a finished run."""
 FULL_LENGTH = 1000
 """Their ticks: the whole reference."""
-PHYSICS_RATE = 600.0
-"""Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +59,7 @@ class Judge:
     def setup(self, policy: Policy, ticks: int) -> Setup:
         """Episodes of ``ticks`` against the reference."""
         features, commands = self.reference.resampled(self.config.control.rate_hz, ticks)
-        return Setup(self.config, policy, TableReward(), ticks, features, commands, PHYSICS_RATE)
+        return Setup(self.config, policy, TableReward(), ticks, features, commands, PHYSICS_RATE_HZ)
 
     def teacher(self, ticks: int, tasks: Sequence[Task]) -> list[tuple[float, bool]]:
         """Returns of the MPC walking the simulated robot itself, each a share of the largest; and whether it fell."""
@@ -83,7 +80,7 @@ def _play(stage: Stage, ticks: int, tasks: Sequence[Task]) -> list[tuple[float, 
 
 def judging_tasks(parameters: np.ndarray) -> list[Task]:
     """Noise, friction and sensors' biases that training never saw."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(VALIDATION_SEED)
     return [Task(parameters, draw(NOISY, rng)) for _ in range(DRAWS)]
 
 
@@ -108,7 +105,7 @@ def study(
         plan = msgspec.convert(
             {
                 "name": f"{variant}-{seed}", "robot": config.robot.name, "config": config_hash(config), "seed": seed,
-                "variant": variant, "terms": terms, "physics_rate_hz": PHYSICS_RATE, "stages": (stage,),
+                "variant": variant, "terms": terms, "stages": (stage,),
             },
             RunPlan,
         )  # fmt: skip

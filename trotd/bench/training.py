@@ -59,6 +59,7 @@ def _compare(reward: str, rounds: int) -> tuple[float, float, float]:
     from runtime import config
     from runtime.control.policy import balance_policy
     from sim.scenario import Scenario
+    from training.plan import PHYSICS_RATE_HZ
     from training.randomize import SENSORS, Conditions
     from training.reference import make_reference
     from training.reward import TableReward, TaskReward
@@ -75,7 +76,7 @@ def _compare(reward: str, rounds: int) -> tuple[float, float, float]:
         TICKS,
         features,
         commands,
-        physics_rate_hz=600.0,
+        physics_rate_hz=PHYSICS_RATE_HZ,
     )
     stage = Stage(setup)
     task = Task(policy.parameters, Conditions(Scenario(noise=SENSORS), wanted))
