@@ -125,7 +125,13 @@ def override(config: Config, place: str, changes: dict[str, Any]) -> Config:
 
 def _contradictions(config: Config) -> Iterator[str]:
     """Pairs of numbers that are each in their bounds but cannot both be true."""
-    joints, grf, limits = config.robot.joints, config.control.grf, config.limits
+    yield from _impossible_body(config)
+    yield from _crossed_bounds(config)
+    yield from _unfit_links(config)
+
+
+def _impossible_body(config: Config) -> Iterator[str]:
+    joints, grf = config.robot.joints, config.control.grf
     for leg, (lower, upper) in enumerate(zip(joints.lower, joints.upper, strict=True)):
         for joint in range(3):
             if lower[joint] >= upper[joint]:
@@ -137,6 +143,10 @@ def _contradictions(config: Config) -> Iterator[str]:
         yield f"control.gait.walking_height = {height}: the leg reaches {config.robot.reach:.3f} m"
     if grf.min_force >= grf.max_force:
         yield f"control.grf.min_force = {grf.min_force}: must be below max_force = {grf.max_force}"
+
+
+def _crossed_bounds(config: Config) -> Iterator[str]:
+    limits = config.limits
     for name in config.tuning.__struct_fields__:
         bounds = getattr(config.tuning, name)
         if isinstance(bounds, tuple) and not bounds[0] < bounds[1]:
@@ -157,6 +167,10 @@ def _contradictions(config: Config) -> Iterator[str]:
         yield f"degrade.voltage_start = {config.degrade.voltage_start}: must pass limits.min_voltage"
     if limits.stall_stand > limits.stall_damp:
         yield f"limits.stall_stand = {limits.stall_stand}: must not pass stall_damp = {limits.stall_damp}"
+
+
+def _unfit_links(config: Config) -> Iterator[str]:
+    """Of the wires to the motors and of the network."""
     if config.bus is not None and config.motors is not None:
         held_up = config.bus.reply_timeout + 2.0 / config.control.rate_hz
         if held_up >= config.motors.watchdog:
