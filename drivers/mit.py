@@ -127,7 +127,9 @@ class MitCodec:
         self._high = np.array([*full, KP_MAX, KD_MAX])
         self._steps = np.array([65535.0, 4095.0, 4095.0, 4095.0, 4095.0])
         self._per_unit = self._steps / (self._high - self._low)
-        self.gain_limit = np.array([KP_MAX, KD_MAX])
+        self.capacity = self._high
+        """The most that a frame can carry of position rad, velocity rad/s, torque N·m, stiffness N·m/rad and damping
+        N·m·s/rad; what is more is clipped. Shape (5,)."""
         self._scale = np.array([1.0, *(1.0 / self._per_unit[:3]), 1.0, 1.0, 1.0])
         self._bias = np.array([0.0, *self._low[:3], 0.0, 0.0, 0.0])
         self._decode = _decode_damiao if self.range.maker == "damiao" else _decode_cubemars

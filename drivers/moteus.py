@@ -63,6 +63,11 @@ _NO_LIMIT = -1
 _VELOCITY, _TORQUE, _KD = 1, 2, 4
 _MAX16, _MAX8 = 32767, 127
 _ABSURD = 1e6
+_CAPACITY = {
+    "float": np.full(5, np.inf),
+    "compact": np.array([1e-4 * _MAX16, 2.5e-4 * _MAX16, 0.01 * _MAX16, 1.0, 1.0]),
+}
+"""Revolutions, revolutions/s, N·m, and multiples of the servo's own two gains."""
 
 
 class MoteusCodec:
@@ -105,8 +110,9 @@ class MoteusCodec:
         self.query = [pad(_QUERY[form])] * len(ids)
         self.stop = [pad(b"\x01\x00\x00" + _QUERY[form])] * len(ids)
         self.enable: list[bytes] | None = None
-        self.gain_limit = np.array([servo_kp / REVOLUTION, servo_kd / REVOLUTION])
-        """Stiffness, N·m/rad, and damping, N·m·s/rad, at scale 1: the most that ``compact`` can ask."""
+        self.capacity = _CAPACITY[form] * [REVOLUTION, REVOLUTION, 1.0, servo_kp / REVOLUTION, servo_kd / REVOLUTION]
+        """The most that a frame can carry of position rad, velocity rad/s, torque N·m, stiffness N·m/rad and damping
+        N·m·s/rad at the motor's output; what is more is clipped. Shape (5,)."""
         self._layout, (self._head1, self._head2, self._head3) = _REPLY[form]
         self._units, self._not_set = _WIRE_UNITS[form], _NOT_SET[form]
         to_wire = np.array([1 / REVOLUTION, 1 / REVOLUTION, 1.0, REVOLUTION / servo_kp, REVOLUTION / servo_kd])

@@ -30,6 +30,9 @@ class MotorCodec(Protocol):
     query: list[bytes]
     stop: list[bytes]
     enable: list[bytes] | None
+    capacity: Array
+    """The most that a frame can carry of position rad, velocity rad/s, torque N·m, stiffness N·m/rad and damping
+    N·m·s/rad at the motor; what is more is clipped. Shape (5,)."""
 
     def encode(self, commands: Array) -> list[bytes]:
         """Frames for position, velocity, torque, kp, kd at the motors (n, 5)."""

@@ -69,7 +69,8 @@ class MotorsConfig(Record, frozen=True, kw_only=True):
     servo_kd: Positive = 10.0
     """moteus: ``servo.pid_position.kd`` that the servos are configured with, N·m per revolution/s."""
     format: Format = "float"
-    """moteus: ``float``, or ``compact`` for smaller frames with gains up to the servos' own."""
+    """moteus: ``float``, or ``compact`` for smaller frames, which carry gains up to ``servo_kp`` and ``servo_kd``; a
+    robot whose numbers they cannot carry is refused."""
     wiggle_torque: Positive = 3.0
     """The most that commissioning's powered wiggle asks of one motor, N·m at the motor."""
     model: str = ""

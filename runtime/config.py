@@ -14,6 +14,7 @@ import msgspec
 from drivers.description import Record, RobotDescription
 from drivers.wiring import BusConfig, ImuConfig, MotorsConfig
 from runtime.control.parameters import ControlConfig
+from runtime.motor_range import uncarried
 from runtime.parameters import (
     ArmingConfig,
     AuditionConfig,
@@ -178,6 +179,8 @@ def _unfit_links(config: Config) -> Iterator[str]:
                 f"bus.reply_timeout = {config.bus.reply_timeout}: with two ticks beside it as long as"
                 f" motors.watchdog = {config.motors.watchdog}: one lost reply would time every motor out"
             )
+    if config.motors is not None:
+        yield from uncarried(config.motors, config.robot, config.control.gains, config.damp, config.tuning)
     if not config.link.allow_unprotected:
         for endpoint in config.link.listen:
             if not _loopback(endpoint) and not (config.link.certificates and endpoint.startswith("tls/")):
