@@ -127,10 +127,7 @@ class World:
         first = self._ticks * self.substeps
         self.motors.take(command, first)
         measurement = self._measurement
-        torques: list[float] = []
-        for index in range(first, first + self.substeps):
-            self._physics_step(index)
-            torques += self.motors.torque
+        torques = self._physics_steps(first)
         self._ticks += 1
         self._sensors.warm(np.array(torques).reshape(self.substeps, 12), self.period)
         self._measurement = self._sense()
@@ -209,16 +206,20 @@ class World:
         """Release the simulator. Harmless when repeated."""
         self._engine.close()
 
-    def _physics_step(self, index: int) -> None:
-        """Run the motors' law on the present joint states, then the physics."""
-        robot = self._robot
-        robot.drive(self.motors.drive(index, self._states))
-        if self._pushes:
-            self._apply_pushes((index + 0.5) * self._dt)
-        if self._held is not None:
-            self._keep_held(self._held[1])
-        self._engine.step()
-        self._states = robot.states()
+    def _physics_steps(self, first: int) -> list[float]:
+        """A tick of the motors' law and the physics, from physics step ``first`` on. Returns every torque exerted."""
+        robot, motors, advance = self._robot, self.motors, self._engine.step
+        torques: list[float] = []
+        for index in range(first, first + self.substeps):
+            robot.drive(motors.drive(index, self._states))
+            if self._pushes:
+                self._apply_pushes((index + 0.5) * self._dt)
+            if self._held is not None:
+                self._keep_held(self._held[1])
+            advance()
+            self._states = robot.states()
+            torques += motors.torque
+        return torques
 
     def _keep_held(self, joint_position: Array | None) -> None:
         assert self._held is not None
