@@ -15,11 +15,17 @@ from faults.power import Disk, PowerCut
 
 from drivers import calibration
 from drivers.calibration import Calibration, fingerprint
+from drivers.commissioning import FoundJoint, joint_name
 from drivers.durable import replacing
 from runtime import config, policies, recording
 from runtime.control.policy import encode_policy
+from runtime.cycle import Fault
+from runtime.faults import FaultHistory, fault_file
+from runtime.messages.fault import Evidence
+from runtime.messages.mode import Mode
 from runtime.messages.tick import TICK_DTYPE
 from runtime.recording import Header, layout, list_recordings
+from trotd.commission.steps import Commission, Task
 
 NAMES = ("first", "second", "third")
 COINS = 6
@@ -37,6 +43,8 @@ class Kept:
     """Names of what is there and whole; raises where something half is believed."""
     shelf: bool = False
     """All that were written stay, instead of the newest."""
+    once: bool = False
+    """What is there already is not written again."""
 
 
 def write_policy(folder: Path, name: str) -> None:
@@ -100,10 +108,45 @@ def find_recordings(folder: Path) -> set[str]:
     return {one.header.reason for one in found}
 
 
+def write_fault(folder: Path, name: str) -> None:
+    history = FaultHistory(fault_file(folder, "stoch3"))
+    history.take(Fault(NAMES.index(name), Mode.WALK, Mode.DAMP, Evidence(reason="tilted", words=name)))
+    history.save()
+    assert not history.problem
+
+
+def find_faults(folder: Path) -> set[str]:
+    history = FaultHistory(fault_file(folder, "stoch3"))
+    assert not history.problem
+    found = [record.evidence.words for record in history.records]
+    assert found == list(NAMES[: len(found)]), "oldest first, none twice"
+    return set(found)
+
+
+def commission(folder: Path) -> Commission:
+    def nobody(_task: Task) -> str:
+        raise AssertionError("nothing is asked")
+
+    return Commission(STOCH3, MOTORS, folder / "stoch3.json", None, nobody)  # type: ignore[arg-type]
+
+
+def write_progress(folder: Path, name: str) -> None:
+    """What commissioning does with every joint that it found."""
+    one = commission(folder)
+    one._found(joint_name(0, NAMES.index(name)), FoundJoint((1, 11 + NAMES.index(name)), 1.0))
+
+
+def find_progress(folder: Path) -> set[str]:
+    joints = commission(folder).progress.joints
+    return {name for index, name in enumerate(NAMES) if joint_name(0, index) in joints}
+
+
 KINDS = {
     "policy": Kept(write_policy, find_policy),
     "calibration": Kept(write_calibration, find_calibration),
     "recording": Kept(write_recording, find_recordings, shelf=True),
+    "fault history": Kept(write_fault, find_faults, shelf=True, once=True),
+    "commissioning": Kept(write_progress, find_progress, shelf=True, once=True),
 }
 
 
@@ -138,7 +181,8 @@ def test_no_cut_loses_or_halves_anything(tmp_path: Path, name: str) -> None:
             under_way = NAMES[written]
             allowed = (certain, certain | {under_way}) if kind.shelf else (certain, {under_way})
             assert kind.find(folder) in allowed, f"power cut before step {cut} ({steps[cut - 1]}), coins {seed}"
-            kind.write(folder, under_way)
+            if under_way not in kind.find(folder) or not kind.once:
+                kind.write(folder, under_way)
             assert under_way in kind.find(folder), "what the cut left is in the way of the next write"
 
 
