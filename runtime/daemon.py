@@ -96,13 +96,17 @@ class Daemon:
         """Serve until a signal or ``stop``.
 
         Raises:
-            AlreadyRunning, LinkError, DriverError, RealtimeError: it could not start.
+            LockError, LinkError, DriverError, RealtimeError: it could not start.
             ExceptionGroup: what broke the loop, after the body was damped.
         """
         self._stop = asyncio.Event()
         notifier = Notifier()
-        alone = state.lock(self.job.folder, self.config.robot.name)
+        folder = self.job.folder
+        alone = state.lock(folder, self.config.robot.name, self.job.memory)
         with alone, contextlib.closing(notifier), stopped_by_signals(self._stop), self.flight.open():
+            if why := state.refusal(folder):
+                self.flight.refused[why] += 1
+                self.cycle.note("state", f"{folder}: {why}: recordings, faults, policies and tuning cannot be kept")
             async with self._connected(), self._linked():
                 await self._serve(notifier)
 

@@ -10,11 +10,19 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from drivers.durable import write_whole
+
+PROBE = 65_536
+"""Bytes that must fit into a state folder that is to keep anything."""
 OWNER = "state"
 """In a folder in memory: the path of the state folder that it belongs to."""
 
 
-class AlreadyRunning(RuntimeError):
+class LockError(RuntimeError):
+    """The robot's lock cannot be had: the message says why, and where."""
+
+
+class AlreadyRunning(LockError):
     """Another daemon serves this robot."""
 
 
@@ -27,25 +35,70 @@ def state_folder() -> Path:
 
 
 @contextlib.contextmanager
-def lock(folder: Path, robot: str) -> Iterator[None]:
+def lock(folder: Path, robot: str, spare: Path | None = None) -> Iterator[None]:
     """Hold the robot's lock; the kernel lets go of it whatever becomes of the process.
+
+    Args:
+        folder: state folder.
+        robot: its name.
+        spare: folder in memory, for a lock that the disk has no room for; one that lies there counts in any case.
 
     Raises:
         AlreadyRunning: another process holds it.
+        LockError: it can lie nowhere.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{robot}.lock"
-    with path.open("a+") as file:
+    name = f"{robot}.lock"
+    with contextlib.ExitStack() as held:
+        refused: OSError | None = None
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            holder = file.read().strip() or "unknown"
-            raise AlreadyRunning(f"robot {robot!r} is served by process {holder} already ({path})") from None
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
+            held.enter_context(_held(folder / name, robot))
+        except OSError as error:
+            refused = error
+        if spare is not None and (refused is not None or (spare / name).exists()):
+            try:
+                held.enter_context(_held(spare / name, robot))
+                refused = None
+            except OSError as error:
+                refused = refused or error
+        if refused is not None:
+            raise LockError(f"robot {robot!r}: no lock in {folder}: {refused.strerror}") from refused
         yield
+
+
+@contextlib.contextmanager
+def _held(path: Path, robot: str) -> Iterator[None]:
+    """Raises OSError where there is no lock and none can be made."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as refused:
+        try:
+            fd = os.open(path, os.O_RDONLY)  # one that is there can be held all the same
+        except OSError:
+            raise refused from None
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.pread(fd, 32, 0).decode(errors="replace").strip() or "unknown"
+            raise AlreadyRunning(f"robot {robot!r} is served by process {holder} already ({path})") from None
+        with contextlib.suppress(OSError):  # who holds it is for the message alone
+            os.ftruncate(fd, 0)
+            os.pwrite(fd, str(os.getpid()).encode(), 0)
+        yield
+    finally:
+        os.close(fd)
+
+
+def refusal(folder: Path) -> str:
+    """Why nothing can be kept in the state folder; empty where it can."""
+    probe = folder / f".{os.getpid()}.probe"
+    try:
+        write_whole(probe, bytes(PROBE))
+        probe.unlink()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
 
 
 def memory_folder(state: Path) -> Path:
@@ -66,7 +119,8 @@ def memory_folder(state: Path) -> Path:
     root.mkdir(mode=0o700, parents=True, exist_ok=True)
     if root.is_symlink() or root.stat().st_uid != os.getuid():
         raise PermissionError(f"{root} is not a folder of this user: remove it")
-    state.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(OSError):  # a disk that refuses is the lock's to tell
+        state.mkdir(parents=True, exist_ok=True)
     for owner in root.glob(f"*/{OWNER}"):
         if not Path(owner.read_text()).is_dir():
             shutil.rmtree(owner.parent, ignore_errors=True)

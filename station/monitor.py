@@ -210,6 +210,12 @@ def examine(ticks: Records, status: Status, config: Config, lost: int) -> list[C
         ),
         Check("solver", _level(fell_back, 0.001, 0.05), f"{fell_back:.1%} of the ticks not by the first solver"),
         Check("wires", _level(wrong, 0.001, math.inf), wires_in_words(status)),
+        Check(
+            "disk",
+            Level.WARNING if status.recordings_refused else Level.OK,
+            ", ".join(f"{why} ({count} times)" for why, count in status.recordings_refused.items())
+            or "takes what is written",
+        ),
         Check("link", _level(lost / len(ticks), 0.01, 0.5), f"{lost} ticks lost on the way here"),
     ]
 

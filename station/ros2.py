@@ -41,18 +41,25 @@ def topic(name: str, kind: str, depth: int = 10) -> Topic:
 
 
 def open_router(endpoint: str) -> Any:
-    """A zenoh session with ROS 2's router.
+    """A zenoh session with ROS 2's router, which may be the one that leads to the daemon too.
 
     Raises:
-        StationError: nobody there; the message says how to start one beside the daemon.
+        StationError: nobody there, or no router; the message says how to start one beside the daemon.
     """
     try:
-        return zenoh.open(session_config(endpoint))
+        session: Any = zenoh.open(session_config(endpoint))
     except zenoh.ZError as error:
         raise StationError(
             f"no zenoh router of ROS 2 at {endpoint}: start one with"
             f" ZENOH_CONFIG_OVERRIDE='listen/endpoints=[\"{endpoint}\"]' ros2 run rmw_zenoh_cpp rmw_zenohd"
         ) from error
+    if not session.info.routers_zid():
+        session.close()
+        raise StationError(
+            f"{endpoint} is no zenoh router: is it the daemon? ROS 2's router has its port to itself;"
+            " start one of both elsewhere: trotd run --listen, or the router's listen/endpoints"
+        )
+    return session
 
 
 class Refused(ValueError):

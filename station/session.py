@@ -21,6 +21,8 @@ from runtime.messages.keys import Keys
 from runtime.messages.status import Status
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+PATIENCE = 5.0
+"""s that a question waits for its answer, where it does not say how long."""
 Answer = TypeVar("Answer")
 
 
@@ -65,25 +67,28 @@ def session_config(endpoint: str) -> zenoh.Config:
 class Station:
     """One robot, as reached from the desk."""
 
-    def __init__(self, session: zenoh.Session, robot: str, endpoint: str) -> None:
+    def __init__(self, session: zenoh.Session, robot: str, endpoint: str, patience: float = PATIENCE) -> None:
         self.session = session
         self.robot = robot
         self.endpoint = endpoint
+        self.patience = patience
+        """s that a question waits for its answer."""
         self.keys = Keys(robot)
 
-    def ask(self, key: str, payload: bytes | None = None, parameters: str = "", timeout: float = 5.0) -> bytes:
+    def ask(self, key: str, payload: bytes | None = None, parameters: str = "", timeout: float | None = None) -> bytes:
         """The one reply to a query on ``key``.
 
         Args:
             key: one of ``keys``.
             payload: what is sent along.
             parameters: zenoh's selector parameters, such as ``write`` or ``name=x``.
-            timeout: how long to wait, s.
+            timeout: how long to wait, s; ``patience`` if not said.
 
         Raises:
             NoAnswer: silence for ``timeout``.
             StationError: the robot answered with an error.
         """
+        timeout = self.patience if timeout is None else timeout
         selector = f"{key}?{parameters}" if parameters else key
         for reply in self.session.get(selector, payload=payload, timeout=timeout):
             if reply.ok is not None:
@@ -98,7 +103,12 @@ class Station:
         )
 
     def ask_for(
-        self, kind: type[Answer], key: str, payload: bytes | None = None, parameters: str = "", timeout: float = 5.0
+        self,
+        kind: type[Answer],
+        key: str,
+        payload: bytes | None = None,
+        parameters: str = "",
+        timeout: float | None = None,
     ) -> Answer:
         """``ask``, with the JSON reply decoded to ``kind``."""
         data = self.ask(key, payload, parameters, timeout)
@@ -107,12 +117,13 @@ class Station:
         except msgspec.MsgspecError as error:
             raise StationError(f"robot {self.robot!r}: reply on {key}: {error}") from error
 
-    def next_status(self, timeout: float = 2.0) -> Status:
+    def next_status(self, timeout: float | None = None) -> Status:
         """The next status that the robot sends.
 
         Raises:
-            NoAnswer: none within ``timeout`` seconds.
+            NoAnswer: none within ``timeout`` seconds; ``patience`` if not said.
         """
+        timeout = self.patience if timeout is None else timeout
         arrived: SimpleQueue[bytes] = SimpleQueue()
         subscriber: Any = self.session.declare_subscriber(self.keys.status, lambda s: arrived.put(s.payload.to_bytes()))
         try:
@@ -126,8 +137,8 @@ class Station:
 
 
 @contextlib.contextmanager
-def connected(robot: str, endpoint: str = DEFAULT_ENDPOINT) -> Iterator[Station]:
-    """A station for ``robot``, closed at the end.
+def connected(robot: str, endpoint: str = DEFAULT_ENDPOINT, patience: float = PATIENCE) -> Iterator[Station]:
+    """A station for ``robot`` that waits ``patience`` seconds for an answer; closed at the end.
 
     Raises:
         StationError: nobody listens at the endpoint, or it refuses this side's certificate.
@@ -139,6 +150,6 @@ def connected(robot: str, endpoint: str = DEFAULT_ENDPOINT) -> Iterator[Station]
         why = "does it run there, and does it know this certificate?" if endpoint.startswith("tls/") else "does it run?"
         raise StationError(f"no daemon to talk to at {endpoint}: {why}") from error
     try:
-        yield Station(session, robot, endpoint)
+        yield Station(session, robot, endpoint, patience)
     finally:
         session.close()

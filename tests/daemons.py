@@ -24,10 +24,13 @@ from runtime.control.policy import Policy
 from runtime.control.posture import Posture
 from runtime.daemon import Daemon, Job
 from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.status import Status
 from runtime.tick_record import Wake
 from station.session import Station, StationError, connected
 
 _numbers = itertools.count()
+PATIENCE = 120.0
+"""s that a test waits for what has to happen, on a machine that may be very busy."""
 QUICK = {
     "posture.soft_start": 0.05,
     "posture.fold_time": 0.05,
@@ -36,6 +39,7 @@ QUICK = {
     "posture.blend_time": 0.02,
     "damp.deadline": 0.3,
     "arming.soak_time": 0.0,  # the machine may be busy: no test is held to a time
+    "command.stand_after": 600.0,
     "arming.max_missed": 1.0,
     "arming.max_lateness": 60.0,
     "limits.stall_stand": 60.0,
@@ -126,7 +130,7 @@ class Served:
 
     async def client(self, act: Callable[[Station], Any]) -> Any:
         def run() -> Any:
-            with connected(self.config.robot.name, self.config.link.listen[0]) as station:
+            with connected(self.config.robot.name, self.config.link.listen[0], PATIENCE) as station:
                 return act(station)
 
         return await asyncio.to_thread(run)
@@ -138,9 +142,7 @@ class Served:
         return reply
 
     async def reach(self, mode: Mode) -> None:
-        async with asyncio.timeout(20):
-            while self.daemon.cycle.state.mode is not mode:  # noqa: ASYNC110
-                await asyncio.sleep(0.005)
+        await self.until(lambda: self.daemon.cycle.state.mode is mode)
 
     async def stand(self) -> None:
         for wish in (Request.ARM, Request.STAND):
@@ -148,14 +150,32 @@ class Served:
         await self.reach(Mode.STAND)
 
     async def until(self, fact: Callable[[], bool]) -> None:
-        async with asyncio.timeout(20):
-            while not fact():  # noqa: ASYNC110
-                await asyncio.sleep(0.005)
+        await until(fact)
+
+    async def ticks(self, count: int) -> None:
+        """Until the loop has lived ``count`` ticks more."""
+        end = self.daemon.flight.recorder.count + count
+        await self.until(lambda: self.daemon.flight.recorder.count >= end)
 
     async def walk(self) -> None:
         await self.stand()
         assert self.daemon.take_request(Request.WALK).accepted
-        await asyncio.sleep(0.05)
+        await self.ticks(10)
+
+
+def status_when(station: Station, fact: Callable[[Status], bool]) -> Status:
+    """The first status of which ``fact`` holds."""
+    end = time.monotonic() + PATIENCE
+    while not fact(status := station.next_status()):
+        assert time.monotonic() < end, status
+    return status
+
+
+async def until(fact: Callable[[], bool]) -> None:
+    """Until ``fact`` holds."""
+    async with asyncio.timeout(PATIENCE):
+        while not fact():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
 
 
 def wake(index: int, rate_hz: float = 200.0) -> Wake:
@@ -164,11 +184,13 @@ def wake(index: int, rate_hz: float = 200.0) -> Wake:
 
 
 @contextmanager
-def running(folder: Path, robot: Path, body: str) -> Iterator[tuple[subprocess.Popen[str], Station]]:
-    """A daemon in a process of its own, all that it leaves below ``folder``, and a client of it."""
+def running(
+    folder: Path, robot: Path, body: str, state: Path | None = None
+) -> Iterator[tuple[subprocess.Popen[str], Station]]:
+    """A daemon in a process of its own, all that it leaves below ``folder``, or in ``state``, and a client of it."""
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "trotd.cli", "run", "--body", body, "--robot", str(robot)]
-    command += ["--listen", endpoint, "--state", str(folder)]
+    command += ["--listen", endpoint, "--state", str(state or folder)]
     environment = os.environ | {"RUNTIME_DIRECTORY": str(folder / "run")}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
     try:
@@ -184,7 +206,7 @@ def _reached(process: subprocess.Popen[str], robot: str, endpoint: str) -> Itera
     end = time.monotonic() + 240.0  # on a busy machine compiling alone takes two minutes
     while True:
         try:
-            with connected(robot, endpoint) as station:
+            with connected(robot, endpoint, PATIENCE) as station:
                 station.next_status()
                 yield station
                 return
@@ -193,10 +215,21 @@ def _reached(process: subprocess.Popen[str], robot: str, endpoint: str) -> Itera
             time.sleep(0.1)
 
 
-def quick_robot(folder: Path, more: str = "") -> Path:
-    """The TOML of a Stoch3 that stands up quickly, with ``more`` tables."""
-    text = (ROBOTS / "stoch3.toml").read_text()
-    posture = "\n".join(f"{key.partition('.')[2]} = {value}" for key, value in QUICK.items() if "posture" in key)
+CALM = ("arming", "limits", "command")
+"""Tables of ``QUICK`` that keep a robot going on a busy machine."""
+
+
+def quick_robot(folder: Path, more: str = "", tables: tuple[str, ...] = ("posture", *CALM)) -> Path:
+    """The TOML of a Stoch3 with ``tables`` of ``QUICK`` and ``more`` of its own."""
     path = folder / "stoch3.toml"
-    path.write_text(f"{text}\n[posture]\n{posture}\n{more}")
+    path.write_text(f"{(ROBOTS / 'stoch3.toml').read_text()}\n{quick_tables(*tables)}\n{more}")
     return path
+
+
+def quick_tables(*tables: str) -> str:
+    """``QUICK`` as TOML: all of it, or these tables."""
+    lines: dict[str, list[str]] = {}
+    for key, value in QUICK.items():
+        table, _, name = key.partition(".")
+        lines.setdefault(table, [f"[{table}]"]).append(f"{name} = {value}")
+    return "\n".join("\n".join(lines[table]) for table in tables or lines)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import stat
-import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -25,6 +24,8 @@ from station.session import NoAnswer, Station, StationError, connected
 from station.tuning import change, known
 
 Try = Callable[[Station], Any]
+SILENCE = 1.0
+"""s after which nobody will answer any more."""
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +62,18 @@ def serve(
 
 
 def see(station: Station) -> str:
-    assert station.ask(station.keys.tick_schema, timeout=5.0)
-    return station.next_status(timeout=5.0).mode
+    assert station.ask(station.keys.tick_schema)
+    return station.next_status().mode
 
 
-def drive(station: Station) -> bool:
-    return json.loads(station.ask(station.keys.mode, b"walk", timeout=1.0))["accepted"]
+def drive(station: Station, timeout: float | None = None) -> bool:
+    return json.loads(station.ask(station.keys.mode, b"walk", timeout=timeout))["accepted"]
 
 
 def teach(station: Station) -> str:
-    policy = json.loads(station.ask(station.keys.policy, timeout=1.0))
+    policy = json.loads(station.ask(station.keys.policy))
     policy["name"] = "taught"
-    reply = station.ask(station.keys.policy, json.dumps(policy).encode(), timeout=5.0)
+    reply = station.ask(station.keys.policy, json.dumps(policy).encode())
     return json.loads(reply)["name"]
 
 
@@ -84,7 +85,6 @@ def test_every_role_sees(bearers: dict[str, Path], tmp_path: Path, monkeypatch: 
 def test_an_operator_drives(bearers: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def attempt(station: Station) -> bool:
         station.session.put(station.keys.velocity, json.dumps({"linear": [0.5, 0.0], "yaw_rate": 0.0}))
-        time.sleep(0.2)
         return drive(station)
 
     answer, served = serve(bearers, tmp_path, monkeypatch, "operator", attempt)
@@ -105,7 +105,7 @@ def test_who_may_not_drive_gets_silence_and_moves_nothing(
         see(station)
         station.session.put(station.keys.velocity, json.dumps({"linear": [0.5, 0.0], "yaw_rate": 0.0}))
         with pytest.raises(NoAnswer, match="may not ask"):
-            drive(station)
+            drive(station, SILENCE)
 
     _, served = serve(bearers, tmp_path, monkeypatch, role.value, attempt)
     events = [event.text for event in served.daemon.link.history]
@@ -132,7 +132,7 @@ def test_who_may_not_set_sees_what_could_be_and_changes_nothing(
         assert known(station) and known_policies(station)
         station.session.put(station.keys.pose, b'{"roll": 0.5, "pitch": 0, "yaw": 0, "height": 0}')
         with pytest.raises(NoAnswer, match="may not ask"):
-            station.ask(station.keys.change_tuning, b'{"name": "swing_height", "value": 0.1}', timeout=1.0)
+            station.ask(station.keys.change_tuning, b'{"name": "swing_height", "value": 0.1}', timeout=SILENCE)
 
     _, served = serve(bearers, tmp_path, monkeypatch, role.value, attempt)
     assert all(entry.wanted == entry.own for entry in served.daemon.list_tuning())
@@ -145,7 +145,7 @@ def test_who_may_not_teach_gets_silence_and_the_policy_stays(
     def attempt(station: Station) -> None:
         see(station)
         with pytest.raises(NoAnswer):
-            station.ask(station.keys.policy, encode_policy(served_policy(station)), timeout=1.0)
+            station.ask(station.keys.policy, encode_policy(served_policy(station)), timeout=SILENCE)
 
     def served_policy(station: Station) -> Any:
         from daemons import make_policy

@@ -315,7 +315,7 @@ def test_a_cancelled_pi3hat_cycle_still_ends_before_the_next():
     release = threading.Event()
 
     def slow(cycle: SimpleNamespace) -> list[SimpleNamespace]:
-        release.wait(2.0)
+        release.wait(60.0)
         return answer_all(cycle)
 
     library = StandIn(slow)

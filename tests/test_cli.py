@@ -119,7 +119,7 @@ def test_a_daemon_serves_the_verbs_and_ends_cleanly(tmp_path: Path) -> None:
             assert other.returncode == 2
             assert other.stderr.splitlines()[-1] == f"trotd: link endpoint {endpoint!r}: address already in use"
             daemon.send_signal(signal.SIGTERM)
-            output, _ = daemon.communicate(timeout=30)
+            output, _ = daemon.communicate(timeout=120)
         finally:
             daemon.kill()
     assert daemon.returncode == 0

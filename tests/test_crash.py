@@ -9,18 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemons import quick_robot, running
+from daemons import PATIENCE, quick_robot, running
 from hypothesis import given
 from hypothesis import strategies as st
 from walks import Walk
 
 from runtime import crash
 from runtime.messages.event import Event
-from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.mode import Mode, Request
 from runtime.recorder import EVENT_DTYPE, EVENTS, Recorder, event_row
 from runtime.recording import SUFFIX, list_recordings, load
 from runtime.replay import replay
 from runtime.state import OWNER, memory_folder
+from station.requests import set_off
 
 
 def left_by(walk: Walk, memory: Path) -> None:
@@ -160,14 +161,7 @@ def test_more_events_than_there_is_room_for(tmp_path: Path) -> None:
 def test_a_walk_that_is_killed_is_there_at_the_next_start(tmp_path: Path, number: signal.Signals) -> None:
     robot = quick_robot(tmp_path)
     with running(tmp_path, robot, "null") as (process, station):
-        for wish, mode in ((Request.ARM, "DAMP"), (Request.STAND, "STAND"), (Request.WALK, "WALK")):
-            end = time.monotonic() + 60.0
-            while not (reply := station.ask_for(ModeReply, station.keys.mode, wish.value.encode())).accepted:
-                assert {check.name for check in reply.checks if not check.ok} == {"timing"}, reply.reason
-                assert time.monotonic() < end, reply.reason
-                time.sleep(0.2)
-            while station.next_status().mode != mode:
-                pass
+        set_off(station)
         for _ in range(20):
             station.session.put(station.keys.velocity, b'{"linear": [0.3, 0.0], "yaw_rate": 0.0}')
             time.sleep(0.02)
@@ -180,7 +174,7 @@ def test_a_walk_that_is_killed_is_there_at_the_next_start(tmp_path: Path, number
             time.sleep(0.05)
         assert station.next_status().mode == "DAMP"
         process.send_signal(signal.SIGTERM)
-        log = process.communicate(timeout=30)[1]
+        log = process.communicate(timeout=PATIENCE)[1]
     assert f"the run before: it ended without a word at {load(written[0]).header.written}" in log
     assert str(written[0]) in log and written[0].name.endswith(f"-crash{SUFFIX}")
     recording = load(written[0])

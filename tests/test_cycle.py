@@ -21,7 +21,7 @@ class Bench:
     """A cycle on the null body, tick by tick."""
 
     def __init__(self, **changes: object) -> None:
-        self.config = make_config(**changes)
+        self.config = make_config(**{"command__stand_after": 2.0} | changes)
         self.cycle = Cycle(self.config, make_policy(self.config.robot.name))
         self.body = Probe(self.config)
         self.command = damp_command(1.0)

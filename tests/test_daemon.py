@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from daemons import Probe, Served, is_damp, make_config, make_policy
+from daemons import PATIENCE, Probe, Served, is_damp, make_config, make_policy
 
 from drivers.errors import BusTimeout, DriverError
 from drivers.robot import Measurement
@@ -49,7 +49,7 @@ def ended_in_damp(body: Probe) -> bool:
 
 def test_start_never_moves_the_robot(tmp_path: Path) -> None:
     async def act(served: Served) -> None:
-        await asyncio.sleep(0.3)
+        await served.ticks(25)
 
     served = serve(tmp_path, act)
     assert len(served.body.commands) > 20
@@ -62,7 +62,7 @@ def test_refused_requests_carry_reasons_and_move_nothing(tmp_path: Path) -> None
         for word, why in (("stand", "arm first"), ("walk", "stand first"), ("sit", "stand first"), ("dance", "one of")):
             reply = await served.ask(word)
             assert not reply.accepted and why in reply.reason and reply.mode == "DAMP"
-        await asyncio.sleep(0.1)
+        await served.ticks(10)
         assert all(is_damp(command) for command in served.body.commands)
 
     serve(tmp_path, act)
@@ -72,7 +72,7 @@ def test_arming_says_what_speaks_against_it(tmp_path: Path) -> None:
     async def act(served: Served) -> None:
         hot = np.full((4, 3), 70.0)
         served.body.change = lambda m: replace(m, joints=replace(m.joints, temperature=hot))
-        await asyncio.sleep(0.05)
+        await served.ticks(3)
         reply = await served.ask("arm")
         assert not reply.accepted and "70 °C, bound 65" in reply.reason
 
@@ -93,7 +93,7 @@ def test_a_client_arms_stands_walks_and_sits(tmp_path: Path) -> None:
 
         await served.client(drive)
         assert (await served.ask("stand")).accepted
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE):
             while not (await served.ask("sit")).accepted:  # noqa: ASYNC110
                 await asyncio.sleep(0.05)
         await served.reach(Mode.DAMP)
@@ -167,7 +167,7 @@ def test_a_bus_that_falls_silent_damps_and_comes_back(tmp_path: Path) -> None:
         await served.reach(Mode.DAMP)
         assert "does not answer" in served.daemon.status().fault
         served.body.before = lambda _body: None
-        await asyncio.sleep(0.05)
+        await served.ticks(3)
         assert not (await served.ask("arm")).accepted
         assert (await served.ask("clear")).accepted
         assert (await served.ask("arm")).accepted
@@ -216,9 +216,7 @@ def test_a_fault_is_recorded_with_all_that_a_replay_needs(tmp_path: Path) -> Non
 
         served.body.change = break_motor
         await served.reach(Mode.DAMP)
-        async with asyncio.timeout(10):
-            while not served.daemon.flight.written:  # noqa: ASYNC110
-                await asyncio.sleep(0.01)
+        await served.until(lambda: bool(served.daemon.flight.written))
 
     served = serve(tmp_path, act)
     recording = load(served.daemon.flight.written[0])
@@ -316,9 +314,7 @@ def test_an_operator_that_goes_away_stops_the_walk(tmp_path: Path) -> None:
             token.undeclare()
 
         await served.client(come_and_go)
-        async with asyncio.timeout(1.5):  # well before the command itself would be given up
-            while served.daemon.cycle.state.mode is not Mode.STAND:  # noqa: ASYNC110
-                await asyncio.sleep(0.005)
+        await served.reach(Mode.STAND)  # the command itself is believed for ten minutes
 
     serve(tmp_path, act)
 
@@ -328,9 +324,7 @@ def test_overruns_are_told(tmp_path: Path) -> None:
 
     async def act(served: Served) -> None:
         served.body.before = lambda _body: time.sleep(0.012)
-        await asyncio.sleep(0.2)
-        served.body.before = lambda _body: None
-        assert served.daemon.status().overruns >= 5
+        await served.until(lambda: served.daemon.status().overruns >= 5)
 
     serve(tmp_path, act)
 
@@ -344,7 +338,7 @@ def test_the_watchdog_is_fed_by_the_tick(tmp_path: Path, monkeypatch: pytest.Mon
         heard: list[str] = []
 
         async def act(served: Served) -> None:
-            await asyncio.sleep(0.3)
+            await served.ticks(60)  # six times what the watchdog is fed after
 
         serve(tmp_path, act)
         while True:
@@ -361,7 +355,7 @@ def test_a_notifier_speaks_to_its_manager_and_outlives_it(monkeypatch: pytest.Mo
     path = str(tmp_path / "manager")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(path)
-        manager.settimeout(5.0)
+        manager.settimeout(PATIENCE)
         monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
         nobodys = Notifier()
         nobodys.tell("READY=1")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
-import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from daemons import Served, make_config
+from disks import fill, forbid, small_file_system
 
 from drivers.robot import Measurement
 from runtime.messages.mode import Mode, Request
@@ -18,39 +17,10 @@ from runtime.messages.recording import RecordingReply
 from runtime.recording import list_recordings, load
 
 
-def mount(*arguments: str) -> None:
-    done = subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        pytest.skip(f"mounting a small disk is not permitted here: {done.stderr.strip()}")
-
-
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 2 MB, which a recording of a few seconds fills."""
-    if shutil.which("mount") is None:
-        pytest.skip("no mount here")
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount("-t", "tmpfs", "-o", "size=2m", "trotd-test", str(disk))
-    try:
+    with small_file_system(tmp_path / "disk") as disk:
         yield disk
-    finally:
-        subprocess.run(["umount", "--lazy", str(disk)], check=True)
-
-
-def fill(disk: Path) -> Callable[[], None]:
-    """Leave an eighth of a megabyte; returns what makes room again."""
-    filler = disk / "filler"
-    filler.write_bytes(bytes(2**20 * 15 // 8))
-    return filler.unlink
-
-
-def forbid(folder: Path) -> Callable[[], None]:
-    """Make a folder read-only, for root as well; returns what undoes it."""
-    folder.mkdir(parents=True)
-    mount("--bind", str(folder), str(folder))
-    mount("-o", "remount,ro,bind", str(folder))
-    return lambda: subprocess.run(["umount", str(folder)], check=True) and None
 
 
 def unfinished(folder: Path) -> list[Path]:
@@ -71,9 +41,7 @@ async def ask(served: Served) -> RecordingReply:
 
 
 async def still_walks(served: Served) -> None:
-    before = served.daemon.flight.recorder.count
-    await asyncio.sleep(0.1)
-    assert served.daemon.flight.recorder.count > before + 3
+    await served.ticks(4)
     assert served.daemon.cycle.state.mode is Mode.WALK and served.daemon.cycle.state.armed
 
 
@@ -91,6 +59,7 @@ def test_a_disk_that_refuses_is_told_and_counted_and_the_walk_goes_on(
         served = Served(made, small_disk, memory=tmp_path / "memory")
         async with served:
             await served.walk()
+            await served.ticks(200)  # more than what is left on the disk
             mend = fill(small_disk) if "space" in trouble else forbid(served.daemon.flight.folder)
             for _ in range(2):
                 reply = await ask(served)
@@ -98,15 +67,14 @@ def test_a_disk_that_refuses_is_told_and_counted_and_the_walk_goes_on(
             await still_walks(served)
             served.body.change = break_motor
             await served.reach(Mode.DAMP)
-            async with asyncio.timeout(10):
-                while served.daemon.status().recordings_refused != {trouble: 3}:  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
-            assert f"{trouble} (3 times so far)" in told(served)[-1] and told(served)[-1].startswith("fault: ")
+            await served.until(lambda: f"{trouble} (3 times so far)" in told(served)[-1])
+            assert told(served)[-1].startswith("fault: ")
+            assert served.daemon.status().recordings_refused == {trouble: 3}
             assert list_recordings(served.daemon.flight.folder) == []
             assert unfinished(small_disk) == []
             served.body.change = lambda measurement: measurement
             mend()
-            await asyncio.sleep(0.05)
+            await served.ticks(3)
             for wish in (Request.CLEAR, Request.ARM):
                 assert served.daemon.take_request(wish).accepted
             reply = await ask(served)
@@ -122,14 +90,13 @@ def test_a_stop_on_a_full_disk_keeps_the_ring_for_the_next_start(small_disk: Pat
     async def walk_and_stop() -> None:
         async with Served(made, small_disk, memory=tmp_path / "memory") as served:
             await served.walk()
+            await served.ticks(200)
             mend.append(fill(small_disk))
 
     async def start_again() -> Path:
         async with Served(made, small_disk, memory=tmp_path / "memory") as served:
-            async with asyncio.timeout(10):
-                while not (found := list_recordings(served.daemon.flight.folder)):  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
-            return found[0]
+            await served.until(lambda: bool(list_recordings(served.daemon.flight.folder)))
+            return list_recordings(served.daemon.flight.folder)[0]
 
     asyncio.run(walk_and_stop())
     assert list_recordings(small_disk / "recordings" / made.robot.name) == []

@@ -13,10 +13,11 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import zenoh
-from daemons import Served, make_config
+from daemons import PATIENCE, Served, make_config
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runtime.doors.crossing import REPEAT_TIME
 from runtime.doors.velocity import SHED
 from runtime.messages.decoding import MessageError
 from runtime.messages.mode import Mode, decode_request
@@ -30,7 +31,7 @@ GARBAGE = (b"\xff", b"{", b"null", b"[]", b"{}", b'{"linear": 3}', b'{"a": ' * 2
 
 def serve(folder: Path, script: Script, **changes: object) -> Served:
     async def play() -> Served:
-        async with Served(make_config(command__stand_after=60.0, **changes), folder) as here:
+        async with Served(make_config(**changes), folder) as here:
             await here.walk()
             await script(here)
             assert here.daemon.cycle.state.mode is Mode.WALK, here.daemon.cycle.state
@@ -55,7 +56,7 @@ def test_garbage_on_every_key_is_refused_counted_and_walked_through(tmp_path: Pa
             station.session.delete(keys.velocity)
 
     async def script(served: Served) -> None:
-        refused = served.daemon.link.entrance.refused
+        refused, began = served.daemon.link.entrance.refused, time.monotonic()
         await served.client(throw)
         await served.until(
             lambda: refused["command/velocity"] >= len(GARBAGE) and refused["command/pose"] >= len(GARBAGE)
@@ -63,7 +64,8 @@ def test_garbage_on_every_key_is_refused_counted_and_walked_through(tmp_path: Pa
         assert all(refused[key] == len(GARBAGE) for key in ("command/mode", "command/tuning", "policy"))
         assert served.daemon.status().refused["policy"] == len(GARBAGE)
         events = [event.text for event in served.daemon.link.history if event.kind == "refused"]
-        assert len(events) < 40, "the same refusal is told once a second"
+        seconds = (time.monotonic() - began) / REPEAT_TIME
+        assert len(events) <= 5 * (seconds + 1.0), "the same refusal is told once a second"
 
     serve(tmp_path, script)
 
@@ -146,7 +148,7 @@ def test_a_reader_that_is_stopped_holds_up_neither_ticks_nor_events_nor_memory(t
             reader.send_signal(signal.SIGSTOP)
             first, used = daemon.cycle.tick["index"][0], _resident()
             sent = 0
-            end = time.monotonic() + 60.0
+            end = time.monotonic() + PATIENCE
             while sent < 60_000_000 and time.monotonic() < end:  # far more than any socket takes
                 for _ in range(200):
                     daemon.link.offer(daemon.cycle.tick)
@@ -160,7 +162,7 @@ def test_a_reader_that_is_stopped_holds_up_neither_ticks_nor_events_nor_memory(t
             last = daemon.cycle.tick["index"][0]
             await served.until(lambda: daemon.cycle.tick["index"][0] > last + 20)
             assert last > first
-            await served.client(lambda station: station.next_status(10.0))  # others are served as before
+            await served.client(lambda station: station.next_status())  # others are served as before
         finally:
             reader.kill()
             reader.wait()

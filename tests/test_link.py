@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from daemons import free_endpoint, make_config, make_policy
+from daemons import PATIENCE, free_endpoint, make_config, make_policy
 
 from runtime.audition import Outcome
 from runtime.config import Config
@@ -126,7 +126,7 @@ class Open:
 
     def run(self, act: Callable[[Station], Any], meanwhile: Callable[[], None] = lambda: None) -> Any:
         def client() -> Any:
-            with connected(self.config.robot.name, self.config.link.listen[0]) as station:
+            with connected(self.config.robot.name, self.config.link.listen[0], PATIENCE) as station:
                 return act(station)
 
         async def main() -> Any:
@@ -153,7 +153,7 @@ def opened(tmp_path: Path) -> Open:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -246,7 +246,7 @@ def test_ticks_go_out_in_batches_and_none_is_missing_or_torn(opened: Open) -> No
         subscriber = station.session.declare_subscriber(
             station.keys.tick, lambda sample: arrived.append(np.frombuffer(sample.payload.to_bytes(), TICK_DTYPE))
         )
-        time.sleep(0.3)  # the declaration has to reach the other side
+        until(lambda: opened.link._ticks.heard)
         listening.set()
         until(lambda: len(arrived) >= 8)
         subscriber.undeclare()
@@ -273,7 +273,7 @@ def test_events_come_in_order_and_stay_to_be_asked_for(opened: Open) -> None:
         subscriber = station.session.declare_subscriber(
             station.keys.event, lambda s: arrived.append(msgspec.json.decode(s.payload.to_bytes(), type=Event))
         )
-        time.sleep(0.3)
+        until(lambda: opened.link._event.heard)
         listening.set()
         until(lambda: len(arrived) == len(sent))
         subscriber.undeclare()
@@ -293,7 +293,8 @@ def test_schema_alive_token_and_channels(tmp_path: Path) -> None:
     opened = Open(tmp_path, [Channel("sim/push", accept=accept)])
 
     def act(station: Station) -> Any:
-        alive = [str(r.ok.key_expr) for r in station.session.liveliness().get(station.keys.alive, timeout=2) if r.ok]
+        replies = station.session.liveliness().get(station.keys.alive, timeout=PATIENCE)
+        alive = [str(reply.ok.key_expr) for reply in replies if reply.ok]
         for data in (b"good", b"bad"):
             station.session.put(station.keys.sim_push, data)
         until(lambda: len(heard) == 1 and len(opened.desk.refused) == 1)
@@ -332,7 +333,6 @@ def test_a_second_daemon_of_the_robot_is_found_over_the_network(tmp_path: Path) 
     async def main() -> None:
         first.link.open()
         try:
-            await asyncio.to_thread(time.sleep, 0.1)
             with pytest.raises(LinkError, match="another daemon holds"):
                 second.link.open()
         finally:

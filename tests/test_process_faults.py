@@ -20,15 +20,14 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from daemons import QUICK, Served, free_endpoint, is_damp, make_config, running
+from daemons import PATIENCE, Served, free_endpoint, is_damp, make_config, quick_robot, running, status_when
 
 from drivers import durable
-from runtime.config import ROBOTS
 from runtime.link import session_config
 from runtime.messages.mode import Mode, ModeReply, Request
 from runtime.messages.recording import RecordingReply
-from runtime.messages.status import Status
 from runtime.recording import list_recordings, load
+from station.requests import CENTRED, set_off
 from station.session import Station, StationError, connected
 
 FORWARD = b'{"linear": [0.3, 0.0], "yaw_rate": 0.0}'
@@ -44,18 +43,10 @@ def serve(folder: Path, act: Callable[[Served], Awaitable[None]], **changes: obj
     return asyncio.run(main())
 
 
-async def ticks(served: Served, count: int) -> None:
-    """Until the loop has lived ``count`` ticks more."""
-    end = int(served.daemon.cycle.tick["index"][0]) + count
-    async with asyncio.timeout(60):
-        while int(served.daemon.cycle.tick["index"][0]) < end:  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
-
-
 async def stopped_by_the_operator(served: Served) -> None:
     """The one thing that must always work, and go out at once."""
     assert (await served.ask("damp")).accepted
-    await ticks(served, 2)
+    await served.ticks(2)
     assert is_damp(served.body.commands[-1]) and served.daemon.cycle.state.mode is Mode.DAMP
 
 
@@ -74,7 +65,7 @@ async def into(served: Served, mode: Mode) -> None:
     await served.stand()
     if mode is not Mode.STAND:
         assert served.daemon.take_request(Request.WALK if mode is Mode.WALK else Request.SIT).accepted
-    await ticks(served, 2)
+    await served.ticks(2)
 
 
 @pytest.mark.parametrize("mode", Mode)
@@ -105,7 +96,7 @@ def test_a_storm_of_garbage_does_not_reach_the_loop(tmp_path: Path) -> None:
         storm = threading.Thread(target=litter, args=(stop,))
         storm.start()
         try:
-            await ticks(served, 150)
+            await served.ticks(150)
             assert not served.task.done()
             await stopped_by_the_operator(served)
         finally:
@@ -132,7 +123,7 @@ def test_a_disk_that_refuses_is_told_and_the_walk_goes_on(
             lambda station: station.ask_for(RecordingReply, station.keys.recording, parameters="write")
         )
         assert not reply.accepted and os.strerror(code) in reply.reason
-        await ticks(served, 20)
+        await served.ticks(20)
         assert served.daemon.cycle.state.mode is Mode.WALK
         assert any(os.strerror(code) in event.text for event in served.daemon.link.history)
         await stopped_by_the_operator(served)
@@ -150,7 +141,7 @@ def test_a_disk_that_hangs_holds_up_neither_the_loop_nor_the_stop_nor_the_dampin
 
     def hang(fd: int) -> None:
         hanging.set()
-        free.wait(30)
+        free.wait(PATIENCE)
         sync(fd)
 
     seen: list[bool] = []
@@ -161,9 +152,8 @@ def test_a_disk_that_hangs_holds_up_neither_the_loop_nor_the_stop_nor_the_dampin
         done = asyncio.get_running_loop().run_in_executor(
             None, lambda: _write_recording(served.config.robot.name, served.config.link.listen[0])
         )
-        while not hanging.is_set():  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
-        await ticks(served, 40)
+        await served.until(hanging.is_set)
+        await served.ticks(40)
         assert served.daemon.cycle.state.mode is Mode.WALK
         watcher = threading.Thread(target=_free_once_damped, args=(served, free, seen))
         watcher.start()
@@ -179,13 +169,13 @@ def test_a_disk_that_hangs_holds_up_neither_the_loop_nor_the_stop_nor_the_dampin
 
 
 def _write_recording(robot: str, endpoint: str) -> None:
-    with connected(robot, endpoint) as station:
-        station.ask(station.keys.recording, parameters="write", timeout=30.0)
+    with connected(robot, endpoint, PATIENCE) as station:
+        station.ask(station.keys.recording, parameters="write")
 
 
 def _free_once_damped(served: Served, free: threading.Event, seen: list[bool]) -> None:
     """Lets the disk go on as soon as the body was damped; or after a while, which is the failure."""
-    end = time.monotonic() + 5.0
+    end = time.monotonic() + 60.0
     count = len(served.body.commands)
     while time.monotonic() < end:
         last = served.body.commands[-3:]
@@ -209,7 +199,7 @@ def test_a_router_that_goes_away_stops_the_walk_and_not_the_daemon(tmp_path: Pat
                 station.session.liveliness().declare_token, f"{station.keys.operator}/through-the-router"
             )
             station.session.put(station.keys.velocity, FORWARD)
-            await ticks(served, 20)
+            await served.ticks(20)
             assert token is not None
             await asyncio.to_thread(router.close)  # type: ignore[arg-type]
             await served.reach(Mode.STAND)
@@ -230,7 +220,7 @@ def test_a_joystick_that_is_killed_stops_the_walk(tmp_path: Path) -> None:
             "        s.session.put(s.keys.velocity, sys.argv[3 + told].encode())\n"
             "        print('x', flush=True); time.sleep(0.02)"
         )
-        arguments = [served.config.robot.name, served.config.link.listen[0], CENTRED, FORWARD.decode()]
+        arguments = [served.config.robot.name, served.config.link.listen[0], CENTRED.decode(), FORWARD.decode()]
         with subprocess.Popen(  # noqa: ASYNC220
             [sys.executable, "-c", code, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         ) as pad:
@@ -239,9 +229,7 @@ def test_a_joystick_that_is_killed_stops_the_walk(tmp_path: Path) -> None:
             await served.walk()
             pad.stdin.write(b"forward\n")
             pad.stdin.flush()
-            async with asyncio.timeout(20):
-                while not served.daemon.cycle.tick["asked_velocity"][0, 0]:  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
+            await served.until(lambda: bool(served.daemon.cycle.tick["asked_velocity"][0, 0]))
             assert served.daemon.cycle.state.mode is Mode.WALK
             pad.kill()
             await served.reach(Mode.STAND)
@@ -274,8 +262,9 @@ def test_a_crowd_at_the_door_and_garbage_from_it(tmp_path: Path) -> None:
                 station = stack.enter_context(connected(robot, endpoint))
                 station.session.declare_subscriber(f"{station.keys.root}/**", lambda _sample: heard.append(1))
             await asyncio.to_thread(storm, host, int(port), random.Random(7))
-            await ticks(served, 40)
-            assert not served.task.done() and heard
+            await served.ticks(40)
+            await served.until(lambda: bool(heard))
+            assert not served.task.done()
         await stopped_by_the_operator(served)
 
     assert ended_in_damp(serve(tmp_path, act))
@@ -299,10 +288,10 @@ def test_garbage_on_every_key_moves_nothing(tmp_path: Path) -> None:
 
     async def act(served: Served) -> None:
         await served.stand()
-        await ticks(served, 20)
+        await served.ticks(20)
         before, policy = served.daemon.cycle.state, served.daemon.cycle.policy
         await served.client(shout)
-        await ticks(served, 20)
+        await served.ticks(20)
         assert served.daemon.cycle.state == before and served.daemon.cycle.policy is policy
         await stopped_by_the_operator(served)
 
@@ -315,7 +304,7 @@ def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path, monkeypatch: pyt
     async def act(served: Served) -> None:
         monkeypatch.setattr(time, "time", lambda: now() + rng.uniform(-3e7, 3e7))
         await served.walk()
-        await ticks(served, 100)
+        await served.ticks(100)
         assert served.daemon.cycle.state.mode is Mode.WALK
         reply = await served.client(
             lambda station: station.ask_for(RecordingReply, station.keys.recording, parameters="write")
@@ -329,61 +318,35 @@ def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path, monkeypatch: pyt
 # Daemons of their own -------------------------------------------------------------------------------------------------
 
 
-def robot_file(folder: Path) -> Path:
-    text = (ROBOTS / "stoch3.toml").read_text()
-    posture = "\n".join(f"{key.partition('.')[2]} = {value}" for key, value in QUICK.items() if "posture" in key)
-    path = folder / "stoch3.toml"
-    path.write_text(f"{text}\n[posture]\n{posture}\n")
-    return path
-
-
-CENTRED = '{"linear": [0.0, 0.0], "yaw_rate": 0.0}'
-"""What a pad says before it may arm."""
-
-
 def walk(station: Station) -> None:
-    for wish, mode in ((Request.ARM, "DAMP"), (Request.STAND, "STAND"), (Request.WALK, "WALK")):
-        until = time.monotonic() + 30.0
-        while not (reply := station.ask_for(ModeReply, station.keys.mode, wish.value.encode())).accepted:
-            assert wish is Request.ARM and time.monotonic() < until, reply.reason
-            time.sleep(0.1)  # the arming list wants to have seen the loop run
-        while station.next_status(10.0).mode != mode:
-            pass
+    set_off(station)
     station.session.put(station.keys.velocity, FORWARD)
-
-
-def newest(station: Station) -> Status:
-    return station.next_status(20.0)
 
 
 def end(process: subprocess.Popen[str]) -> None:
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=60)
+    process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
 
 
 def test_a_process_that_is_stopped_and_goes_on_counts_what_it_missed_and_stands(tmp_path: Path) -> None:
-    with running(tmp_path, robot_file(tmp_path), "null") as (process, station):
+    robot = quick_robot(tmp_path, tables=("posture", "arming", "limits"))
+    with running(tmp_path, robot, "null") as (process, station):
         walk(station)
-        before = newest(station)
+        before = station.next_status()
         process.send_signal(signal.SIGSTOP)
         time.sleep(2.5)
         process.send_signal(signal.SIGCONT)
-        time.sleep(0.3)
-        after = newest(station)
-        while after.overruns == before.overruns:
-            after = newest(station)
-        assert after.overruns - before.overruns >= 300
-        while after.mode == "WALK":  # the command is older than what the walk may go on without
-            after = newest(station)
-        assert after.mode in ("STAND", "DAMP") and after.velocity_command == (0.0, 0.0, 0.0)
+        status_when(station, lambda status: status.overruns - before.overruns >= 300)
+        rested = status_when(station, lambda status: status.mode != "WALK")  # nobody has said anything for too long
+        assert rested.mode in ("STAND", "DAMP") and rested.velocity_command == (0.0, 0.0, 0.0)
         assert station.ask_for(ModeReply, station.keys.mode, b"damp").accepted
         end(process)
 
 
 def test_the_operators_stop_gets_through_while_another_process_takes_the_core(tmp_path: Path) -> None:
     core = min(os.sched_getaffinity(0))
-    with running(tmp_path, robot_file(tmp_path), "null") as (process, station):
+    with running(tmp_path, quick_robot(tmp_path), "null") as (process, station):
         walk(station)
         for task in Path(f"/proc/{process.pid}/task").iterdir():
             with contextlib.suppress(ProcessLookupError):
@@ -393,9 +356,9 @@ def test_the_operators_stop_gets_through_while_another_process_takes_the_core(tm
             for hog in hogs:
                 os.sched_setaffinity(hog.pid, {core})
             time.sleep(1.0)
-            reply = json.loads(station.ask(station.keys.mode, b"damp", timeout=20.0))
+            reply = json.loads(station.ask(station.keys.mode, b"damp"))
             assert reply["accepted"] and reply["mode"] == "DAMP"
-            assert newest(station).mode == "DAMP"
+            assert station.next_status().mode == "DAMP"
         finally:
             for hog in hogs:
                 hog.kill()
@@ -405,7 +368,7 @@ def test_the_operators_stop_gets_through_while_another_process_takes_the_core(tm
 
 @pytest.mark.parametrize("mode", ["DAMP", "STAND", "WALK"])
 def test_a_daemon_killed_in_any_mode_starts_again_in_damp_with_its_state_whole(tmp_path: Path, mode: str) -> None:
-    robot = robot_file(tmp_path)
+    robot = quick_robot(tmp_path)
     with running(tmp_path, robot, "null") as (process, station):
         if mode != "DAMP":
             walk(station)
@@ -414,7 +377,7 @@ def test_a_daemon_killed_in_any_mode_starts_again_in_damp_with_its_state_whole(t
         process.kill()
         process.wait()
     with running(tmp_path, robot, "null") as (process, station):
-        first = newest(station)
+        first = station.next_status()
         assert first.mode == "DAMP" and not first.armed
         end(process)
     for file in list_recordings(tmp_path / "recordings" / "stoch3"):

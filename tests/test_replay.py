@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from daemons import Served, make_config
+from daemons import Served, make_config, quick_tables
 from walks import Walk, walk_around
 
 from runtime.config import ROBOTS
@@ -127,19 +127,15 @@ def test_what_a_daemon_recorded_replays(tmp_path: Path) -> None:
         made = make_config()
         async with Served(made, tmp_path) as served:
             await served.walk()
-            await asyncio.sleep(0.4)
+            await served.ticks(80)
             assert served.daemon.take_request(Request.STAND).accepted
-            await asyncio.sleep(0.3)
+            await served.ticks(60)
             return served.daemon.flight.write("test")
 
     path = asyncio.run(play())
     recording = load(path)
     quick = (ROBOTS / "stoch3.toml").read_text().replace('name = "stoch3"', f'name = "{recording.header.robot}"')
-    quick += (
-        "\n[posture]\nsoft_start = 0.05\nfold_time = 0.05\nrise_time = 0.05\nsettle_time = 0.01\nblend_time = 0.02\n"
-        "\n[arming]\nsoak_time = 0.0\nmax_missed = 1.0\nmax_lateness = 60.0\n"
-    )
-    result = replay(changed(recording, robot_toml=quick))
+    result = replay(changed(recording, robot_toml=f"{quick}\n{quick_tables()}"))
     assert result.difference is None and result.ticks > 100 and "WALK" in result.modes
 
 

@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from daemons import Served, free_endpoint, make_config, running
+from daemons import CALM, PATIENCE, Served, free_endpoint, make_config, quick_robot, running, until
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.records import Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
 
-from runtime.config import ROBOTS
-from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.mode import Mode
 from runtime.messages.tick import TICK_DTYPE
 from station import cdr, ros_messages
 from station.cdr import CdrError
+from station.requests import set_off
 from station.rmw_zenoh import Attachment, Node, Reliability, Role, Topic, decode_attachment, gid_of
 from station.ros2 import COMMANDS, Bridge, Clock, open_router, topic
 from station.session import StationError, connected
@@ -163,11 +163,11 @@ def router() -> Iterator[tuple[Any, str]]:
 
 
 @contextmanager
-def bridged(served: Served, endpoint: str, **options: Any) -> Iterator[Bridge]:
-    """The bridge on a thread of its own, as its process would run it."""
+def bridged(served: Served, endpoint: str, daemon: str = "", **options: Any) -> Iterator[Bridge]:
+    """The bridge on a thread of its own, as its process would run it; the daemon is where it listens, or ``daemon``."""
     made = served.config
     stop = threading.Event()
-    with connected(made.robot.name, made.link.listen[0]) as station, open_router(endpoint) as ros:
+    with connected(made.robot.name, daemon or made.link.listen[0]) as station, open_router(endpoint) as ros:
         bridge = Bridge(station, ros, 5, made.control.bounds, **options)
         thread = threading.Thread(target=bridge.run, args=(100.0, lambda: not stop.is_set(), lambda _bridge: None))
         thread.start()
@@ -203,12 +203,6 @@ class Peer:
         self.session.put(topic("/cmd_vel", kind).key(5), congestion_control=zenoh.CongestionControl.BLOCK, **sent)
 
 
-async def until(reached: Any) -> None:
-    async with asyncio.timeout(20):
-        while not reached():  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
-
-
 def test_the_robot_is_a_node_whose_messages_another_reads(tmp_path: Path) -> None:
     async def main() -> None:
         async with Served(make_config(), tmp_path) as served:
@@ -233,7 +227,7 @@ def test_the_robot_is_a_node_whose_messages_another_reads(tmp_path: Path) -> Non
             for data, attachment in messages:
                 read: Any = read_message(kind, data)
                 stamp = (read.transforms[0] if kind.startswith("tf2") else read).header.stamp
-                assert abs(stamp.sec + stamp.nanosec * 1e-9 - attachment.stamp * 1e-9) < 1.0
+                assert abs(stamp.sec + stamp.nanosec * 1e-9 - attachment.stamp * 1e-9) < PATIENCE  # of one clock
 
     asyncio.run(main())
 
@@ -297,11 +291,38 @@ def test_an_observer_declares_no_subscription(tmp_path: Path) -> None:
             with router() as (session, endpoint), bridged(served, endpoint, observe=True, namespace="/a") as bridge:
                 await until(lambda: bridge.published > 0)  # by then everything is declared
                 tokens: list[str] = []
-                end = time.monotonic() + 20.0
+                end = time.monotonic() + PATIENCE
                 while len(tokens) < 5 and time.monotonic() < end:
                     tokens = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/5/**")]
             assert len(tokens) == 5 and not any("/MS/" in token for token in tokens)
             assert any("/%a%joint_states/" in token for token in tokens)
+
+    asyncio.run(main())
+
+
+def test_the_daemon_and_ros_share_a_router_that_runs_already(tmp_path: Path) -> None:
+    async def main() -> None:
+        with router() as (session, endpoint):
+            async with Served(make_config(link__connect=[endpoint]), tmp_path) as served:
+                with bridged(served, endpoint, daemon=endpoint) as bridge:
+                    peer, row = Peer(session), served.daemon.cycle.tick
+                    await until(lambda: len(peer.heard) == 4)
+                    peer.steer(COMMANDS[0], 0.0)
+                    await until(lambda: bridge.steering.counts["taken"] == 1)
+                    await served.walk()
+                    peer.steer(COMMANDS[0], 0.3)
+                    await until(lambda: row["asked_velocity"][0].tolist() == [0.3, 0.0, 0.0])
+                    peer.subscriber.undeclare()
+                await served.reach(Mode.STAND)
+
+    asyncio.run(main())
+
+
+def test_a_daemon_is_not_taken_for_a_router(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Served(make_config(), tmp_path) as served:
+            with pytest.raises(StationError, match="is no zenoh router: is it the daemon"):
+                await asyncio.to_thread(open_router, served.config.link.listen[0])
 
     asyncio.run(main())
 
@@ -313,28 +334,22 @@ def test_a_router_that_is_not_there_is_one_line_with_what_to_do() -> None:
 
 def test_cmd_vel_moves_the_simulated_robot(tmp_path: Path) -> None:
     """Both commands as a user starts them; the speed is read from /odom."""
-    robot = ROBOTS / "stoch3.toml"
+    robot = quick_robot(tmp_path, tables=CALM)
     with router() as (session, endpoint), running(tmp_path, robot, "sim") as (_, station):
         command = [sys.executable, "-m", "trotd.cli", "ros2", "--connect", station.endpoint, "--router", endpoint]
         neighbour = subprocess.Popen([*command, "--domain", "5"], stderr=subprocess.PIPE, text=True)
         try:
             peer = Peer(session)
             odometry = topic("/odom", "nav_msgs/msg/Odometry").key(5)
-            for wish, mode in ((Request.ARM, "DAMP"), (Request.STAND, "STAND"), (Request.WALK, "WALK")):
-                end = time.monotonic() + 30.0
-                while not (reply := station.ask_for(ModeReply, station.keys.mode, wish.value.encode())).accepted:
-                    assert wish is Request.ARM and time.monotonic() < end, reply.reason
-                    time.sleep(0.1)  # the arming list wants to have seen the loop run
-                while station.next_status().mode != mode:
-                    pass
-            end = time.monotonic() + 60.0
+            set_off(station)
+            end = time.monotonic() + PATIENCE
             while time.monotonic() < end and (len(peer.heard.get(odometry, [])) < 10 or speed(peer, odometry) < 0.25):
                 peer.steer(COMMANDS[0], 0.4)
                 time.sleep(0.05)
             assert speed(peer, odometry) >= 0.25
             peer.subscriber.undeclare()
             neighbour.send_signal(signal.SIGINT)
-            words = neighbour.communicate(timeout=30)[1]
+            words = neighbour.communicate(timeout=PATIENCE)[1]
             assert neighbour.returncode == 130 and "Traceback" not in words
         finally:
             neighbour.kill()

@@ -140,6 +140,10 @@ def test_every_checkpoint_is_a_policy_that_the_robot_accepts(
         policy = policies.load(trainer.folder.policy_file(iteration), "stoch3")
         assert policy.provenance["iteration"] == iteration
         assert policy.provenance["run"]["seed"] == 5
+        assert policy.rate_hz == config.control.rate_hz and policy.layout
+        policies.check_manifest(policy, config.control.rate_hz, config.audition.max_norm, "trained")
+        with pytest.raises(policies.PolicyError, match="rate_hz = 200: this robot ticks at 500"):
+            policies.check_manifest(policy, 500.0, config.audition.max_norm, "trained")
     assert np.abs(policies.load(trainer.folder.policy_file(0), "stoch3").parameters).max() == 0
 
 

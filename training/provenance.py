@@ -9,6 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 import msgspec
 
 from runtime.config import Config
+from runtime.control.policy import Policy
+from runtime.policies import layout_hash
 
 PACKAGES = ("trotd", "numpy", "numba", "daqp", "pybullet", "scipy")
 
@@ -18,6 +20,11 @@ def config_hash(config: Config) -> str:
     control = msgspec.structs.replace(config.control, policy="")
     data = msgspec.json.encode((config.robot, control), order="deterministic")
     return hashlib.sha256(data).hexdigest()[:16]
+
+
+def declared(policy: Policy, config: Config) -> Policy:
+    """``policy`` with the rate and the layout that it is trained with: what a robot's door holds it against."""
+    return msgspec.structs.replace(policy, rate_hz=config.control.rate_hz, layout=layout_hash(policy.output))
 
 
 def versions() -> dict[str, str]:

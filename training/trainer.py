@@ -17,7 +17,7 @@ from training import pgpe
 from training.checkpoint import Checkpoint, Row, RunFolder
 from training.evaluators import Evaluator
 from training.plan import RunPlan, StagePlan
-from training.provenance import versions
+from training.provenance import declared, versions
 from training.randomize import SENSORS, SETS, Conditions, draw
 from training.reference import Reference
 from training.reward import TableReward, TaskReward
@@ -65,7 +65,8 @@ class Trainer:
         self.config, self.plan, self.folder = config, plan, folder
         self._make_evaluator, self._reference = make_evaluator, reference
         height = config.control.gait.walking_height
-        self.template: Policy = make_policy(config.robot, height, VARIANTS[plan.variant], plan.terms, plan.name)
+        shape = make_policy(config.robot, height, VARIANTS[plan.variant], plan.terms, plan.name)
+        self.template: Policy = declared(shape, config)
         self._first = self.template.parameters if first is None else first
         self._courses = [self._course(stage) for stage in plan.stages]
 

@@ -62,12 +62,12 @@ def _one_line_errors() -> Iterator[None]:
     from drivers.errors import DriverError
     from runtime.link import LinkError
     from runtime.realtime import RealtimeError
-    from runtime.state import AlreadyRunning
+    from runtime.state import LockError
     from station.session import StationError
 
     try:
         yield
-    except (ValueError, LinkError, AlreadyRunning, RealtimeError, ImportError) as error:
+    except (ValueError, LinkError, LockError, RealtimeError, ImportError) as error:
         _leave(error, BAD_INPUT)
     except (DriverError, StationError, OSError) as error:
         _leave(error, FAILED)
@@ -110,7 +110,7 @@ def run(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     with _one_line_errors():
         from runtime import daemon, policies
-        from runtime.state import memory_folder, state_folder
+        from runtime.state import state_folder
         from trotd.bodies import build_body, lenient
 
         config, path = _load(robot, rate_hz, listen)
@@ -131,11 +131,21 @@ def run(
             part.channels,
             _say_ready,
             simulated=body != "hardware",
-            memory=memory_folder(place),
+            memory=_memory(place),
             checks=part.checks,
         )
         for written in daemon.main(job).flight.written:
             typer.echo(f"recording: {written}")
+
+
+def _memory(state: Path) -> Path | None:
+    from runtime.state import memory_folder
+
+    try:
+        return memory_folder(state)
+    except OSError as error:
+        logging.getLogger("trotd").warning("nothing is kept over a crash: %s", error)
+        return None
 
 
 def _say_ready() -> None:
@@ -182,12 +192,13 @@ def status(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPO
 
 
 def _ask(word: str, robot: str, connect: str) -> ModeReply:
-    from runtime.messages.mode import ModeReply
+    from runtime.messages.mode import Request
+    from station.requests import request
     from station.session import connected
 
     config, _ = _load(robot, None, None)
     with connected(config.robot.name, connect) as station:
-        return station.ask_for(ModeReply, station.keys.mode, word.encode())
+        return request(station, Request(word))
 
 
 def _say_reply(reply: ModeReply) -> None:

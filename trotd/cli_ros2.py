@@ -24,7 +24,9 @@ def register(app: typer.Typer) -> None:
 def ros2(
     robot: RobotOption = "stoch3",
     connect: ConnectOption = ENDPOINT,
-    router: Annotated[str, typer.Option(help="ROS 2's zenoh router; the daemon has ROS 2's own port 7447.")] = ROUTER,
+    router: Annotated[
+        str, typer.Option(help="ROS 2's zenoh router that runs: this command connects to it, and listens nowhere.")
+    ] = ROUTER,
     domain: Annotated[int | None, typer.Option(min=0, max=232, help="Domain id; ROS_DOMAIN_ID or 0 if none.")] = None,
     namespace: Annotated[str, typer.Option(help="Of the node and its topics; /tf is everybody's.")] = "/",
     hz: Annotated[float, typer.Option(min=1.0, max=1000.0, help="Messages a second on each topic at most.")] = 50.0,
@@ -37,20 +39,21 @@ def ros2(
     walks: `trotd arm`, `trotd stand`, `trotd walk` come first. It is cut to the robot's bounds; when it stops coming,
     the robot stops after 0.2 s and stands after 2 s.
 
-    ROS 2's router must not be on the daemon's port:
+    ROS 2's router and the daemon both come up on port 7447, so one of them has to move. The router:
     `ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7448"]' ros2 run rmw_zenoh_cpp rmw_zenohd`
+
+    Or the daemon, beside a router that runs already: `trotd run --listen tcp/127.0.0.1:7449`, then
+    `trotd ros2 --connect tcp/127.0.0.1:7449 --router tcp/127.0.0.1:7447`
     """
     from rich.console import Console
     from rich.live import Live
 
     from runtime import config
     from station.ros2 import Bridge, open_router
-    from station.session import StationError, connected
+    from station.session import connected
 
     end = time.monotonic() + seconds if seconds > 0 else float("inf")
     with refusals():
-        if router == connect:
-            raise StationError(f"--router {router} is the daemon's own endpoint: ROS 2's router needs another")
         number = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
         known = config.load(config.find_robot(robot))
         with connected(known.robot.name, connect) as station, open_router(router) as ros:

@@ -19,16 +19,16 @@ import numpy as np
 
 from runtime import config
 from runtime.control.records import Records
-from runtime.messages.mode import ModeReply
 from runtime.recording import SUFFIX, load
+from station.requests import set_off
 from station.session import NoAnswer, Station, StationError, connected
 
 ROBOT = "stoch3"
 PRIORITY = 80
 WALK = 3
 """``runtime.messages.mode.Mode.WALK``."""
-PATIENCE = 20.0
-"""s for which a refused request is asked again."""
+PATIENCE = 30.0
+"""s that the daemon may take to answer, or to send a status."""
 START = 240.0
 """s that a daemon may take to start: compiled code may have to be made anew."""
 
@@ -133,7 +133,7 @@ def _reached(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> Iter
         if process.poll() is not None:
             raise StationError(f"the daemon ended: {log.read_text()[-500:]}")
         try:
-            with connected(ROBOT, endpoint) as station:
+            with connected(ROBOT, endpoint, PATIENCE) as station:
                 station.next_status()
                 yield station
                 return
@@ -143,22 +143,6 @@ def _reached(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> Iter
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.2)
-
-
-def set_off(station: Station) -> None:
-    """Arm, stand up and walk; what is refused is asked again for a while.
-
-    Raises:
-        StationError: it is refused still.
-    """
-    for word, mode in (("arm", "DAMP"), ("stand", "STAND"), ("walk", "WALK")):
-        deadline = time.monotonic() + PATIENCE
-        while not (reply := station.ask_for(ModeReply, station.keys.mode, word.encode())).accepted:
-            if time.monotonic() > deadline:
-                raise StationError(f"{word}: {reply.reason}")
-            time.sleep(0.05)
-        while station.next_status().mode != mode:
-            pass
 
 
 @contextlib.contextmanager

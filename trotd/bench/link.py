@@ -37,8 +37,9 @@ from runtime.messages.tick import TICK_DTYPE
 from runtime.policies import find_policy, load
 from runtime.shelf import PolicyFile
 from runtime.status import build_status
+from station.requests import set_off
 from station.session import Station
-from trotd.bench.daemon import ROBOT, Walking, free_endpoint, may_fifo, set_off, walking_daemon
+from trotd.bench.daemon import ROBOT, Walking, free_endpoint, may_fifo, walking_daemon
 from trotd.bench.report import Figure, Finding, shown
 
 RATE = 200.0
