@@ -147,7 +147,9 @@ def connected(robot: str, endpoint: str = DEFAULT_ENDPOINT, patience: float = PA
     try:
         session: Any = zenoh.open(session_config(endpoint))
     except zenoh.ZError as error:
-        why = "does it run there, and does it know this certificate?" if endpoint.startswith("tls/") else "does it run?"
+        why = "is `trotd run` up there (its first start compiles for minutes), and is this what it listens on?"
+        if endpoint.startswith("tls/"):
+            why = "does it run there, and does it know this certificate?"
         raise StationError(f"no daemon to talk to at {endpoint}: {why}") from error
     try:
         yield Station(session, robot, endpoint, patience)

@@ -122,6 +122,7 @@ def run(
 
             config = with_baseline(body, config, place)
         part = build_body(body, config, path, place, observe)
+        logging.getLogger("trotd").info("starting; the first start after an installation compiles for minutes")
         job = daemon.Job(
             config,
             path.read_text(),

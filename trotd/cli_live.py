@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trotd.cli_station import ENDPOINT, ConnectOption, RobotOption, refusals
+from trotd.cli_station import ENDPOINT, ConnectOption, RobotOption, UsageError, refusals
 
 if TYPE_CHECKING:
     from station.session import Station
@@ -55,7 +55,7 @@ def push(
 
     with _robot(robot, connect) as station:
         if policy is not None and rollback:
-            raise StationError("either a policy or --rollback")
+            raise UsageError("either a policy or --rollback, not both")
         if policy is None and not rollback:
             current, digest = active(station)
             typer.echo(f"{current.name} {digest[:12]} is active")
@@ -138,13 +138,12 @@ def get(
     """Show what can be set: the value in force, the robot's own, the bounds, and what is saved."""
     import msgspec
 
-    from station.session import StationError
     from station.tuning import describe, known
 
     with _robot(robot, connect) as station:
         entries = [entry for entry in known(station) if name in (None, entry.name)]
         if not entries:
-            raise StationError(f"{name!r} cannot be set; trotd get lists what can")
+            raise UsageError(f"{name!r} cannot be set; trotd get lists what can")
         typer.echo(msgspec.json.encode(entries).decode() if json else "\n".join(describe(entry) for entry in entries))
 
 

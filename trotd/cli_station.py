@@ -17,9 +17,16 @@ RobotOption = Annotated[str, typer.Option("--robot", help="A shipped robot's nam
 ConnectOption = Annotated[str, typer.Option("--connect", help="Where the daemon listens.")]
 
 
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+
+class UsageError(ValueError):
+    """Options that make no sense together: the message says which do."""
+
+
 @contextlib.contextmanager
 def refusals() -> Iterator[None]:
-    """What the user can mend, as one line and exit code 1; Ctrl-C as 130."""
+    """Bad input as one line and exit code 2; what the robot, the link or the disk refuses as 1; Ctrl-C as 130."""
     from runtime.config import ConfigError
     from runtime.policies import PolicyError
     from runtime.recording import RecordingError
@@ -28,11 +35,14 @@ def refusals() -> Iterator[None]:
 
     try:
         yield
-    except (ConfigError, PolicyError, RecordingError, ReplayError, StationError, OSError) as error:
+    except (ConfigError, PolicyError, RecordingError, UsageError) as error:
         typer.echo(f"trotd: {error}", err=True)
-        sys.exit(1)
+        sys.exit(BAD_INPUT)
+    except (ReplayError, StationError, OSError) as error:
+        typer.echo(f"trotd: {error}", err=True)
+        sys.exit(FAILED)
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
 
 
 @app.command()
@@ -246,12 +256,11 @@ def export(
     """Write a recording as CSV, MCAP or RRD."""
     from runtime.recording import load
     from station.export import EXPORTS
-    from station.session import StationError
 
     with refusals():
         wanted = {kind: path for kind, path in (("csv", csv), ("mcap", mcap), ("rrd", rrd)) if path is not None}
         if not wanted:
-            raise StationError("name at least one of --csv, --mcap, --rrd")
+            raise UsageError("name at least one of --csv FILE, --mcap FILE, --rrd FILE")
         loaded = load(recording)
         for kind, path in wanted.items():
             EXPORTS[kind](loaded, path)
@@ -284,11 +293,10 @@ def add_key(
     """Make a certificate: for the robot, or for a person who sees, drives or teaches it."""
     from runtime.access import Role
     from station.keys import add_bearer
-    from station.session import StationError
 
     with refusals():
         if role not in list(Role):
-            raise StationError(f"role = {role!r}: must be one of {', '.join(Role)}")
+            raise UsageError(f"role {role!r}: must be one of {', '.join(Role)}")
         folder = add_bearer(authority, Role(role), name, tuple(host or ()))
         typer.echo(f"{folder}: copy its three files to the bearer")
         use = "link.certificates in the robot's TOML names it" if role == Role.ROBOT else "TROTD_CERTIFICATES names it"
