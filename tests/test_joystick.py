@@ -406,7 +406,7 @@ def test_after_a_silent_network_the_sticks_have_to_be_centred(tmp_path: Path) ->
                 await talk(station, 0.3)
                 assert _asked(served) == [0.3, 0.0, 0.0]
                 await until(lambda: bool(tick["clamps"][0] & Clamp.EXPIRED))  # nobody says anything
-                await until(lambda: time.monotonic() - entrance._heard > EXPIRY)
+                await until(lambda: time.monotonic() - entrance._velocity._heard > EXPIRY)
                 for number in range(5):
                     say(0.3)(station)
                     await until(lambda n=number: entrance.refused["command/velocity"] > n)  # type: ignore[misc]
