@@ -66,6 +66,8 @@ class Job:
     """The body is none that could break."""
     memory: Path | None = None
     """Where the ring of ticks lies: a folder that is kept in RAM spares the disk. Without one, the state folder."""
+    policy_file: bytes = b""
+    """What ``policy`` was read from; encoded anew if not given."""
     checks: Callable[[], Sequence[ArmingCheck]] = field(default=tuple)
     """What the body itself adds to the arming list."""
 
@@ -82,7 +84,7 @@ class Daemon:
         name = job.config.robot.name
         memory = (job.memory or job.folder / "memory") / name
         self.flight = FlightLog(job.config, job.robot_toml, job.folder / "recordings" / name, memory, self.cycle)
-        self.shelf = Shelf(self.cycle, job.folder, name, self.flight.take_policy)
+        self.shelf = Shelf(self.cycle, job.folder, name, self.flight.take_policy, job.policy_file)
         self.history = FaultHistory(fault_file(job.folder, name))
         self.audition = Audition(self.cycle, self.shelf, job.config.audition)
         self.tuning = Tuning(job.config, self.cycle.controller.tuning, job.folder / "tuning" / f"{name}.json")

@@ -41,9 +41,13 @@ class Shelf:
         folder: Path,
         robot: str,
         note: Callable[[int, bytes], None] = lambda _generation, _data: None,
+        data: bytes = b"",
     ) -> None:
-        """``note`` is told the generation and the file of every policy that becomes active."""
-        self.active = PolicyFile(cycle.policy, encode_policy(cycle.policy))
+        """``note`` is told the generation and the file of every policy that becomes active.
+
+        ``data`` is the file that the cycle's policy was read from; as ``encode_policy`` makes it, if not given.
+        """
+        self.active = PolicyFile(cycle.policy, data or encode_policy(cycle.policy))
         self.good = [self.active]
         """Proved good, or given at the start; the newest last."""
         self._cycle, self._note = cycle, note

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -42,8 +43,31 @@ def drive(
     console = Console(stderr=True)
     if keys:
         console.print(terminal.HELP, highlight=False)
-    with Live(console=console, refresh_per_second=5, transient=True) as live, contextlib.suppress(KeyboardInterrupt):
-        joystick.run(lambda: open_source(keys, pad, mapping), lambda j: live.update(describe(j)), lambda: True)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.suppress(KeyboardInterrupt))
+        show = _line(stack.enter_context(Live(console=console, refresh_per_second=5, transient=True)))
+        joystick.run(
+            lambda: open_source(keys, pad, mapping), show if console.is_terminal else _lines(console), lambda: True
+        )
+
+
+def _line(live: Live) -> Callable[[Joystick], None]:
+    """For a terminal: one line that is always up to date."""
+    return lambda joystick: live.update(describe(joystick))
+
+
+def _lines(console: Console) -> Callable[[Joystick], None]:
+    """For what is no terminal: a line whenever there is something new to say."""
+    last = ""
+
+    def show(joystick: Joystick) -> None:
+        nonlocal last
+        mode = "the robot is not heard" if joystick.status is None or joystick.deaf else joystick.status.mode
+        if (words := f"{mode}: {joystick.words}") != last:
+            last = words
+            console.print(words, highlight=False)
+
+    return show
 
 
 def describe(joystick: Joystick) -> Text:

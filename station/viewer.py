@@ -6,6 +6,7 @@ and memory has a bound on both sides.
 
 from __future__ import annotations
 
+import os
 import resource
 import sys
 import time
@@ -60,6 +61,7 @@ class Screen:
                 )
                 rr.serve_web_viewer(web_port=self.web_port, open_browser=False, connect_to=url)
             else:
+                _need_display()
                 rr.spawn(
                     port=self.grpc_port,
                     memory_limit=self.memory,
@@ -70,6 +72,12 @@ class Screen:
         except (OSError, RuntimeError) as error:
             raise StationError(f"viewer: {error}") from error
         return stream
+
+
+def _need_display() -> None:
+    """Raises StationError where no window can open."""
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        raise StationError("no display for a window: --web serves a browser, --save FILE.rrd writes a file")
 
 
 def view_recording(path: Path, screen: Screen) -> rr.RecordingStream:

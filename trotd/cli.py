@@ -114,7 +114,8 @@ def run(
         from trotd.bodies import build_body, lenient
 
         config, path = _load(robot, rate_hz, listen)
-        chosen = policies.load(policies.find_policy(policy or config.control.policy, path.parent), config.robot.name)
+        policy_path = policies.find_policy(policy or config.control.policy, path.parent)
+        chosen = policies.load(policy_path, config.robot.name)
         place = folder or state_folder()
         config = lenient(body, config)
         if body in ("hardware", "twin"):
@@ -133,6 +134,7 @@ def run(
             _say_ready,
             simulated=body != "hardware",
             memory=_memory(place),
+            policy_file=policy_path.read_bytes(),
             checks=part.checks,
         )
         for written in daemon.main(job).flight.written:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -29,7 +28,7 @@ def _robot(robot: str, connect: str) -> Iterator[Station]:
 
 
 def push(
-    policy: Annotated[Path | None, typer.Argument(help="A policy file.", exists=True, dir_okay=False)] = None,
+    policy: Annotated[str | None, typer.Argument(help="A policy file, or a shipped one's name.")] = None,
     robot: RobotOption = "stoch3",
     connect: ConnectOption = ENDPOINT,
     rollback: Annotated[bool, typer.Option("--rollback", help="Back to the last one that proved good.")] = False,
@@ -40,6 +39,8 @@ def push(
 ) -> None:
     """Send a policy to the robot, or have it take the one before again; without either, say which is active.
 
+    Example: `trotd push runs/trot-1/trot.json`, `trotd push --rollback`
+
     A standing or walking robot runs the candidate in shadow for 2 s, takes it over on four feet or where the gait
     changes legs, blends it in over 0.5 s and watches it for 3 s; when tilt, height, clamps or failed solutions rise, it
     returns to the policy before and says why. What has walked so long without that is kept for the next start.
@@ -48,6 +49,7 @@ def push(
     """
     import msgspec
 
+    from runtime.policies import find_policy
     from runtime.proving import describe
     from station.push import active, roll_back
     from station.push import push as send
@@ -61,7 +63,7 @@ def push(
             typer.echo(f"{current.name} {digest[:12]} is active")
             return
         with _told(station):
-            reply = send(station, policy, immediate) if policy is not None else roll_back(station)
+            reply = send(station, find_policy(policy), immediate) if policy is not None else roll_back(station)
         if json:
             typer.echo(msgspec.json.encode(reply).decode())
         elif reply.report:

@@ -57,7 +57,12 @@ def view(
     memory: Annotated[str, typer.Option(help="The viewer's memory at most.")] = "1GiB",
     seconds: Annotated[float, typer.Option(help="Stop after this time; 0 for never.")] = 0.0,
 ) -> None:
-    """See the robot: body, forces, charts and events, live or from a recording."""
+    """See the robot: body, forces, charts and events, live or from a recording.
+
+    Opens a window; `--web` serves a browser instead, and `--save` writes a file for `rerun` on another machine.
+
+    Example: `trotd view`, `trotd view --web`, `trotd view crash.trotd --save crash.rrd`
+    """
     import time
 
     from runtime import config
@@ -94,13 +99,18 @@ def joystick(
     """Drive with a pad or the keyboard.
 
     Back damps, Start holds, X sits, Y stands (with the right bumper held it arms first), B walks. Left stick forward
-    and turn, right stick sideways; nothing moves unless the right bumper is held.
+    and turn, right stick sideways; nothing moves unless the right bumper is held. A: the sticks lean the standing body.
+    Left bumper: the next gait. Ctrl-C leaves, and a walking robot stands.
+
+    Example: `trotd joystick --keyboard`, `trotd joystick --speed 1 --pad /dev/input/event5`
     """
     from runtime import config
     from station.desk import drive
     from station.session import connected
 
     with refusals():
+        if keyboard and not sys.stdin.isatty():
+            raise UsageError("--keyboard reads a terminal's keys, and this is none")
         known = config.load(config.find_robot(robot))
         with connected(known.robot.name, connect) as station:
             drive(station, known.control.bounds, keyboard, pad, mapping, speed)
@@ -114,7 +124,10 @@ def monitor(
     hz: Annotated[float, typer.Option(min=0.1, max=20, help="How often.")] = 2.0,
     count: Annotated[int, typer.Option(help="Stop after so many; 0 for never.")] = 0,
 ) -> None:
-    """Asked against applied, with the reason of every clamp, and what happened lately."""
+    """Asked against applied, with the reason of every clamp, and what happened lately. Ctrl-C ends it.
+
+    Example: `trotd monitor`, `trotd monitor --json --hz 10 --count 100 > walk.jsonl`
+    """
     from collections import deque
     from itertools import islice
 
@@ -186,7 +199,10 @@ def recordings(
     write: Annotated[bool, typer.Option("--write", help="Write what the recorder holds now, first.")] = False,
     to: Annotated[Path, typer.Option("--to", help="Folder to fetch into.", file_okay=False)] = Path(),
 ) -> None:
-    """List the robot's recordings, or fetch one over the link."""
+    """List the robot's recordings, or fetch one over the link.
+
+    Example: `trotd recordings --write`, then `trotd recordings NAME --to .` with a name of the list
+    """
     from runtime import config
     from runtime.messages.recording import RecordingEntry, RecordingReply
     from station.session import StationError, connected
@@ -201,6 +217,7 @@ def recordings(
                     raise StationError(f"robot {known.robot.name!r}: {reply.reason}")
                 typer.echo(f"written on the robot: {reply.path}")
             if name is not None:
+                to.mkdir(parents=True, exist_ok=True)
                 path = to / Path(name).name
                 path.write_bytes(station.ask(key, parameters=f"name={name}", timeout=60.0))
                 typer.echo(f"fetched: {path} ({path.stat().st_size} bytes)")
@@ -214,8 +231,13 @@ def replay(
     recording: Annotated[Path, typer.Argument(help="A .trotd file.", exists=True, dir_okay=False)],
     policy: Annotated[Path | None, typer.Option(help="Ask what this policy would have done.", exists=True)] = None,
 ) -> None:
-    """Run a recording through the core again: bit for bit the same, or the first tick and stage that differ."""
+    """Run a recording through the core again: bit for bit the same, or the first tick and stage that differ.
+
+    Exit code 1 where it differs. With --policy: how far another policy's commands would have been from those then.
+    """
     import time
+
+    from rich.console import Console
 
     from runtime import policies
     from runtime.recording import load
@@ -231,10 +253,11 @@ def replay(
             typer.echo(f"  feed-forward torque {other.torque:.2f} N·m")
             typer.echo(f"  ticks with a clamp {other.clamped_before:.1%} then, {other.clamped_now:.1%} now")
             return
-        next(Player(loaded).play(), None)  # compiled code is loaded before the clock runs
-        began = time.perf_counter()
-        result = play(loaded)
-        speed = result.ticks / loaded.header.rate_hz / (time.perf_counter() - began)
+        with Console(stderr=True).status("replaying"):
+            next(Player(loaded).play(), None)  # compiled code is loaded before the clock runs
+            began = time.perf_counter()
+            result = play(loaded)
+            speed = result.ticks / loaded.header.rate_hz / (time.perf_counter() - began)
         modes = ", ".join(f"{name} {count}" for name, count in result.modes.items())
         typer.echo(
             f"{result.ticks} ticks ({modes}), {result.skipped} before the first keyframe, {speed:.0f} x real time"
@@ -253,7 +276,12 @@ def export(
     mcap: Annotated[Path | None, typer.Option("--mcap", help="ROS 2 messages, for Foxglove.")] = None,
     rrd: Annotated[Path | None, typer.Option("--rrd", help="For rerun.")] = None,
 ) -> None:
-    """Write a recording as CSV, MCAP or RRD."""
+    """Write a recording as CSV, MCAP or RRD; several at once if asked for.
+
+    Example: `trotd export walk.trotd --csv walk.csv --mcap walk.mcap`
+    """
+    from rich.console import Console
+
     from runtime.recording import load
     from station.export import EXPORTS
 
@@ -263,7 +291,8 @@ def export(
             raise UsageError("name at least one of --csv FILE, --mcap FILE, --rrd FILE")
         loaded = load(recording)
         for kind, path in wanted.items():
-            EXPORTS[kind](loaded, path)
+            with Console(stderr=True).status(f"writing {path}"):
+                EXPORTS[kind](loaded, path)
             typer.echo(f"{path}: {path.stat().st_size} bytes")
 
 
