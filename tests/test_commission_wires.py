@@ -21,8 +21,9 @@ from runtime import config
 from sim.build import Build, build_of, lab_build, scrambled
 from trotd.wire import MEETING, calibration_file, own_wires, twin_folder
 
-PATIENCE = 120.0
+PATIENCE = 600.0
 """s, of a computer that does many other things."""
+pytestmark = pytest.mark.timeout(1200)
 
 
 class Shell:

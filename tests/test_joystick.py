@@ -244,6 +244,10 @@ def test_standing_up_arms_only_with_the_dead_man_held() -> None:
 # With a daemon -------------------------------------------------------------------------------------------------------
 
 
+EXPIRY = 3.0
+"""s, more than a busy machine pauses."""
+
+
 class Desk:
     """A joystick on a thread of its own, and the bytes that its pad sends."""
 
@@ -280,7 +284,7 @@ def _serve_and_drive(tmp_path: Path, fifo: tuple[Path, int], script: Script) -> 
     desk = Desk(*fifo)
 
     async def play() -> None:
-        async with Served(make_config(), tmp_path) as served, desk.at(served):
+        async with Served(make_config(command__expiry=EXPIRY), tmp_path) as served, desk.at(served):
             await script(served, desk)
 
     asyncio.run(play())
@@ -296,6 +300,18 @@ async def _hears(served: Served, count: int) -> None:
     for _ in range(count):
         last = served.daemon.cycle.sources.velocity.stamp
         await until(lambda last=last: served.daemon.cycle.sources.velocity.stamp != last)  # type: ignore[misc]
+
+
+async def _lean(served: Served, desk: Desk) -> None:
+    """Right, and down; from the start where the joystick did not hear the robot for a moment."""
+    pose, middle = served.daemon.cycle.tick["tuned_body_pose"][0], axis(RISE, 0) + CENTRED
+    async with asyncio.timeout(PATIENCE):
+        while not (pose[0] > 0.2 and pose[3] < -0.05):
+            if not desk.driving.posing:
+                desk.send(middle + button(304) + REPORT)
+            else:
+                desk.send(axis(TURN, 32767) + axis(RISE, 32767) + REPORT if desk.driving.centred else middle)
+            await asyncio.sleep(0.3)
 
 
 async def _push_forward(served: Served, fd: int) -> None:
@@ -330,14 +346,10 @@ def test_a_leans_the_standing_body_and_the_gait_button_changes_the_gait(tmp_path
         desk.send(CENTRED + button(BUMPER) + button(308) + REPORT)
         await served.reach(Mode.STAND)
         await until(lambda: desk.mode == "STAND")
-        desk.send(button(304) + REPORT)
-        await until(lambda: desk.driving.posing and desk.driving.centred)
-        desk.send(axis(TURN, 32767) + axis(RISE, 32767) + REPORT)  # right, and down
-        await until(lambda: tick["tuned_body_pose"][0, 0] > 0.2 and tick["tuned_body_pose"][0, 3] < -0.05)
+        await _lean(served, desk)
         desk.send(axis(TURN, 0) + axis(RISE, 0) + button(304) + button(310) + REPORT)
         await until(lambda: not tick["tuned_body_pose"].any())
         await until(lambda: tick["tuned_gait_offset"][0].tolist() == [0.75, 0.25, 0.0, 0.5])
-        await until(lambda: any(words.startswith("gait walk: gait = walk") for words in desk.said))
 
     said = _serve_and_drive(tmp_path, fifo, script)
     assert "the sticks move the body" in said
@@ -360,7 +372,7 @@ def test_a_pad_that_is_pulled_out_makes_a_walking_robot_stand_and_nothing_moves_
         return os.open(path, os.O_RDWR)
 
     async def play() -> None:
-        async with Served(make_config(), tmp_path) as served:
+        async with Served(make_config(command__expiry=EXPIRY), tmp_path) as served:
             fd = plug()
             async with Desk(path, fd).at(served):
                 await _walk_forward(served, fd)
@@ -377,10 +389,6 @@ def test_a_pad_that_is_pulled_out_makes_a_walking_robot_stand_and_nothing_moves_
                 os.close(fd)
 
     asyncio.run(play())
-
-
-EXPIRY = 3.0
-"""s, more than a busy machine pauses."""
 
 
 def test_after_a_silent_network_the_sticks_have_to_be_centred(tmp_path: Path) -> None:
@@ -436,7 +444,7 @@ def test_a_driver_s_process_that_is_killed_makes_a_walking_robot_stand(tmp_path:
     path, fd = fifo
 
     async def play() -> None:
-        async with Served(make_config(), tmp_path) as served:
+        async with Served(make_config(command__expiry=EXPIRY), tmp_path) as served:
             made = served.config
             command = [sys.executable, "-c", DRIVER, made.robot.name, made.link.listen[0], str(path)]
             driver = await asyncio.to_thread(subprocess.Popen, command)
@@ -469,7 +477,7 @@ def test_a_refusal_is_shown_with_its_reason(tmp_path: Path, fifo: tuple[Path, in
 
 def test_a_driver_that_leaves_makes_a_walking_robot_stand(tmp_path: Path) -> None:
     async def play() -> None:
-        async with Served(make_config(), tmp_path) as served:
+        async with Served(make_config(command__expiry=EXPIRY), tmp_path) as served:
 
             def hold_token(station: Station) -> None:
                 token = station.session.liveliness().declare_token(f"{station.keys.operator}/1")
@@ -487,7 +495,7 @@ def test_a_driver_that_leaves_makes_a_walking_robot_stand(tmp_path: Path) -> Non
 
 def test_a_driver_that_leaves_moves_nothing_that_does_not_walk(tmp_path: Path) -> None:
     async def play() -> None:
-        async with Served(make_config(), tmp_path) as served:
+        async with Served(make_config(command__expiry=EXPIRY), tmp_path) as served:
             await until(lambda: served.daemon.flight.recorder.count > 2)
             assert served.daemon.take_request(Request.ARM).accepted
             await served.client(

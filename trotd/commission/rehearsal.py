@@ -26,12 +26,13 @@ TILT = 0.5
 """rad that the body is tilted by."""
 TURN = 0.35
 """rad that a joint is turned by."""
-MEETING_TIME, HANDS_TIME = 20.0, 5.0
-"""s that the twin may take to be met, and to be where the hands hold it."""
+MEETING_TIME, HANDS_TIME = 60.0, 60.0
+"""s that the twin may take to be met, and to be where the hands hold it, on a computer that does much else."""
 CLOSE = 0.03
 """rad."""
-STILL, REST, HANGING_TIME = 0.01, 0.3, 20.0
-"""Legs that were let go hang still when no joint turns by more than this, rad, in s; waited for at most, s."""
+STILL, REST, HANGING_TIME = 0.01, 30, 120.0
+"""Legs that were let go hang still when no joint turns by more than this, rad, in so many messages of the twin, which
+it sends by its own time; waited for at most, s."""
 _RPY = ((0.0, 0.0, 0.0), (0.0, TILT, 0.0), (-TILT, 0.0, 0.0))
 
 
@@ -105,8 +106,7 @@ class Rehearsal:
         end = time.monotonic() + HANGING_TIME
         while time.monotonic() < end:
             before = _joints_of(self._look())
-            time.sleep(REST)
-            self._before = _joints_of(self._look())
+            self._before = _joints_of(self._look(count=REST))
             if np.abs(self._before - before).max() < STILL:
                 break
         return ""
@@ -131,13 +131,15 @@ class Rehearsal:
                 return
         raise DriverError("the twin does not follow the hands that hold it: does it still run?")
 
-    def _look(self, seconds: float = HANDS_TIME) -> SimTruth:
-        """The twin as it is now."""
+    def _look(self, seconds: float = HANDS_TIME, count: int = 1) -> SimTruth:
+        """The twin as it is now, or ``count`` messages later."""
         self._watched()
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if seen := self._watched():
-                return seen[-1]
+                count -= len(seen)
+                if count <= 0:
+                    return seen[-1]
             time.sleep(0.005)
         raise DriverError("nothing is seen of the twin: does trotd twin run, with the same --connect?")
 
