@@ -348,8 +348,9 @@ class Cycle:
         state = self.state
         if state.mode is not before.mode:
             self.note("mode", f"{before.mode.name} -> {state.mode.name}: {state.reason.words}")
+            moving = before.mode is _WALK or (before.mode is _STAND and not self._settled(_STAND))
             self._record.blank_plan()
             now = float(self._row["stamp"])
-            self.sources.change(before.mode, state.mode, measurement, state.reason.is_fault, now)
+            self.sources.change(before.mode, state.mode, measurement, state.reason.is_fault, now, moving)
         elif state.armed != before.armed or state.fault is not before.fault:
             self.note("mode", f"{state.mode.name}: {state.reason.words}")

@@ -40,13 +40,26 @@ class Fault:
         if self.reason in WHOLE:
             return "standing: sits down; walking: stops, stands, sits down"
         if self.reason in SEATED:
-            return "standing: sits down; walking: damps"
+            return "standing: sits down; walking: folds its legs, damps"
         return "damps"
 
 
 TABLE: tuple[Fault, ...] = (
-    Fault("a motor is silent", Reason.STALE_MOTOR, "limits.judge_joint", "`max_age`", INJECTED),
-    Fault("no motor answers", Reason.BODY_SILENT, "drivers.hardware", "1", f"{CYCLE}::test_a_silent_body_damps"),
+    Fault(
+        "a motor is silent",
+        Reason.MOTOR_FAULT,
+        "drivers.motors",
+        "`coasted_ticks` + 1: 3",
+        f"{TORTURE}::test_a_sample_of_the_matrix_holds_its_bounds",
+    ),
+    Fault("a motor's reply is older than it may be", Reason.STALE_MOTOR, "limits.judge_joint", "`max_age`", INJECTED),
+    Fault(
+        "no motor answers",
+        Reason.BODY_SILENT,
+        "drivers.hardware",
+        "`coasted_ticks` + 1: 3",
+        f"{CYCLE}::test_a_silent_body_damps",
+    ),
     Fault("a motor reports a fault", Reason.MOTOR_FAULT, "limits.judge_joint", "1", INJECTED),
     Fault(
         "one reply is late or lost",
@@ -54,7 +67,7 @@ TABLE: tuple[Fault, ...] = (
         "limits.judge_joint",
         "1",
         f"{PLAUSIBILITY}::test_a_joint_that_was_silent_for_two_ticks_does_not_jump",
-        "the last reading stands in (`COASTED`)",
+        "the last reading stands in (`COASTED`); nothing is judged by it that needs this tick's",
     ),
     Fault("a motor is too hot", Reason.HOT_MOTOR, "limits.judge_joint", "1", INJECTED),
     Fault(
@@ -108,6 +121,21 @@ TABLE: tuple[Fault, ...] = (
         "encoders.look_at_encoder",
         "`stuck_time`",
         f"{PLAUSIBILITY}::test_an_encoder_that_stands_still_while_its_leg_moves_is_found",
+    ),
+    Fault(
+        "an encoder is stuck, in a walk",
+        Reason.STUCK_ENCODER,
+        "encoders.look_at_encoder",
+        "2 to 20",
+        f"{PLAUSIBILITY}::test_an_encoder_that_stands_still_while_its_joint_is_told_to_move_is_found_at_once",
+    ),
+    Fault(
+        "an encoder is stuck while the robot stands still",
+        Reason.STUCK_ENCODER,
+        "encoders.look_at_encoder",
+        "at the first tilt of `stuck_tilt` or the first step",
+        f"{PLAUSIBILITY}::test_an_encoder_that_stands_still_while_the_robot_tilts_is_found",
+        "nothing until it shows: its motor holds with the torque that it held with before; then damps",
     ),
     Fault("a motor gives no torque", Reason.TORQUE_LOST, "plausibility.look_at_motor", "0.14 s", WEAK_MOTOR),
     Fault("a motor turns the wrong way", Reason.REVERSED_MOTOR, "plausibility.look_at_motor", "0.05 s", WEAK_MOTOR),

@@ -220,6 +220,8 @@ class Guard:
         b["torque_follow"], b["rest_follow"] = _share(period, limits.torque_share_time), _share(period, REST_TIME)
         b["tracking_error"], b["tracking_time"] = limits.max_tracking_error, limits.tracking_time
         b["stuck_time"], b["stuck_motion"] = limits.stuck_time - 0.5 * period, limits.stuck_motion
+        b["stuck_tilt"], b["stuck_told"] = limits.stuck_tilt, limits.stuck_told
+        b["roughness"] = limits.max_roughness
         b["stuck_torque"], b["clamped_torque"] = limits.stuck_torque, limits.clamped_torque
         b["stop_lower"] = np.array(description.joints.lower) + limits.joint_margin
         b["stop_upper"] = np.array(description.joints.upper) - limits.joint_margin

@@ -138,8 +138,8 @@ class Reaction(IntEnum):
     STOP_AND_SIT = 2
     """A walk ends in standing first; then down on the legs, then damp."""
     SIT_DOWN = 3
-    """Down on the legs where it stands, then damp; from a walk damp at once: without attitude or policy nothing
-    keeps a walking robot up until it stands."""
+    """Down on the legs where it stands, then damp; in a walk the legs fold at once, joint by joint: without attitude
+    or policy nothing keeps a walking robot up until it stands."""
     DAMP = 4
 
 
@@ -307,10 +307,10 @@ def _give_up(state: ModeState, verdict: Reason, answer: Reaction, settled: bool)
     if answer is Reaction.STAND:
         return replace(state, reason=verdict) if mode is Mode.WALK and not stopping(state) else state
     unsteady = mode is Mode.WALK or (mode is Mode.STAND and not settled)
-    if answer is Reaction.DAMP or mode is Mode.DAMP or (unsteady and answer is Reaction.SIT_DOWN):
+    if answer is Reaction.DAMP or mode is Mode.DAMP:
         return replace(_damped(state, verdict), fault=verdict)
     fault = verdict if state.fault is Reason.OK else state.fault
-    to = mode if unsteady else Mode.SIT_DOWN
+    to = mode if unsteady and answer is not Reaction.SIT_DOWN else Mode.SIT_DOWN
     return state if state.fault is fault and mode is to else replace(state, mode=to, reason=verdict, fault=fault)
 
 

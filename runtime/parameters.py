@@ -49,7 +49,11 @@ class LimitsConfig(Record, frozen=True, kw_only=True):
     clamped_torque: Annotated[float, Meta(gt=0, le=2)] = 0.7
     """... (the same, where the ground or an end stop may clamp the joint) ..."""
     stuck_motion: Angle = 0.3
-    """... or another joint of its leg by so much, rad."""
+    """... or another joint of its leg by so much, rad ..."""
+    stuck_tilt: Angle = 0.03
+    """... or a standing robot leant by so much about the joint's axis, rad; ..."""
+    stuck_told: Angle = 0.08
+    """... or, in a walk and at once, when the joint's target went so far while the reading kept still, rad."""
     imu_extrapolation: Annotated[int, Meta(ge=0, le=10)] = 2
     """Ticks for which a missing or unbelievable IMU sample is replaced by the last one, turned on by its own rate."""
     frozen_time: Positive = 0.05
@@ -68,6 +72,9 @@ class LimitsConfig(Record, frozen=True, kw_only=True):
     """Way of a joint between two ticks beyond what its speed explains, rad."""
     max_position_noise: Positive = 0.01
     """The same, on the mean over 0.1 s, rad."""
+    max_roughness: Positive = 0.004
+    """A joint whose torque does not fit its command has a noisy encoder, not a weak motor, when its way from tick to
+    tick differs so much from the mean of its speeds, on the mean over 0.1 s, rad."""
     max_tracking_error: Positive = 0.8
     """Between a joint and its target, rad."""
     tracking_time: Positive = 0.15
@@ -135,6 +142,12 @@ class PostureConfig(Record, frozen=True, kw_only=True):
     """Rest between the acts, s."""
     blend_time: Positive = 0.3
     """Hand-over from one source of commands to the next, s."""
+    brace_time: Positive = 0.6
+    """What a walking robot that has lost attitude, policy or forces takes to fold its legs below it, s."""
+    brace_gain: Annotated[float, Meta(gt=0, le=1)] = 0.3
+    """Share of the stiffness meanwhile."""
+    brace_damping: Annotated[float, Meta(gt=0, le=2)] = 0.75
+    """Share of the damping meanwhile."""
     fold_height: Annotated[float, Meta(gt=0, lt=1)] = 0.3
     """Foot to hip when folded, as a share of thigh + shank."""
 

@@ -206,6 +206,10 @@ def look_at_joint(t, b, m, leg, joint):  # type: ignore[no-untyped-def]
         find(m, b, _JUMPING, 3 * leg + joint, way, way - excess + b.position_jump)
     if m.noise[leg, joint] > b.position_noise:
         find(m, b, _NOISY, 3 * leg + joint, m.noise[leg, joint], b.position_noise)
+    if t.joint_age[leg, joint] < PROMPT * b.period and m.age[leg, joint] < PROMPT * b.period:
+        explained = 0.5 * (t.joint_velocity[leg, joint] + m.velocity[leg, joint]) * since
+        differs = abs(t.joint_position[leg, joint] - m.position[leg, joint] - explained)
+        m.rough[leg, joint] += (differs - m.rough[leg, joint]) * b.noise_share
 
 
 @compiled
@@ -227,7 +231,9 @@ def look_at_motor(t, b, m, leg, joint):  # type: ignore[no-untyped-def]
         m.torque_share[leg, joint] += (share - m.torque_share[leg, joint]) * b.torque_follow
     else:
         m.torque_share[leg, joint] += (1.0 - m.torque_share[leg, joint]) * b.rest_follow
-    if m.torque_share[leg, joint] < b.torque_share:
+    if m.torque_share[leg, joint] < b.torque_share and m.rough[leg, joint] > b.roughness:
+        find(m, b, _NOISY, 3 * leg + joint, m.rough[leg, joint], b.roughness)
+    elif m.torque_share[leg, joint] < b.torque_share:
         against = share < -b.torque_share
         find(m, b, _REVERSED if against else _TORQUE_LOST, 3 * leg + joint, m.torque_share[leg, joint], b.torque_share)
     astray = gain > 0.0 and abs(error) > b.tracking_error

@@ -77,8 +77,13 @@ class Sources:
         self.fall_left -= self._period
         return self.fall
 
-    def change(self, before: Mode, after: Mode, measurement: Measurement | None, fault: bool, now: float) -> None:
-        """Make ready for a mode that differs from the one before; without a measurement it is DAMP."""
+    def change(
+        self, before: Mode, after: Mode, measurement: Measurement | None, fault: bool, now: float, moving: bool = False
+    ) -> None:
+        """Make ready for a mode that differs from the one before; without a measurement it is DAMP.
+
+        ``moving``: it walks, or stands on less than four feet.
+        """
         self.hand_over()
         if _DAMP in (before, after):
             self.blend_left = 0.0
@@ -87,6 +92,9 @@ class Sources:
             self.posture.reset()
         elif after is _STAND_UP:
             self.posture.stand_up(measurement)
+        elif after is _SIT_DOWN and moving:
+            self.posture.brace(measurement)
+            self.blend_left = 0.0
         elif after is _SIT_DOWN:
             self.posture.sit_down(measurement, bearing=before in (_STAND, _WALK))
         elif after is _STAND and before is _STAND_UP:

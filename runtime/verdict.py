@@ -51,6 +51,9 @@ BOUNDS_DTYPE = np.dtype(
         ("stuck_torque", "f8"),  # share of the peak torque
         ("clamped_torque", "f8"),
         ("stuck_motion", "f8"),
+        ("stuck_tilt", "f8"),  # change of gravity's direction in the body
+        ("stuck_told", "f8"),
+        ("roughness", "f8"),
         ("stop_lower", "f8", (4, 3)),  # between these no end stop holds a joint
         ("stop_upper", "f8", (4, 3)),
         ("action", "f8", (18,)),
@@ -93,12 +96,15 @@ MEMORY_DTYPE = np.dtype(
         ("velocity", "f8", (4, 3)),
         ("age", "f8", (4, 3)),
         ("noise", "f8", (4, 3)),  # low-passed unexplained way, rad
+        ("rough", "f8", (4, 3)),  # low-passed way that differs from the mean of two speeds, rad
         ("torque_share", "f8", (4, 3)),  # low-passed measured torque over the commanded one
         ("astray", "f8", (4, 3)),  # s for which a joint has been far from its target
         ("still", "f8", (4, 3)),  # s since the reading last changed, negative before the first
         ("lowest", "f8", (4, 3)),  # torque since then, N·m
         ("highest", "f8", (4, 3)),
         ("still_leg", "f8", (4, 3, 3)),  # for each joint, its leg's joints then, rad
+        ("still_tilt", "f8", (4, 3)),  # gravity's direction then, along the axis across which it would move the joint
+        ("told", "f8", (4, 3)),  # way that its target has gone since then, rad
         ("commands", "f8", (2, 5, 4, 3)),  # of the last tick and the one before
         # punctuality
         ("overruns", "u4"),

@@ -199,10 +199,18 @@ def test_a_controller_that_finds_nothing_sits_a_standing_robot_down(
     assert bench.cycle.state.fault is Reason.BAD_COMMAND, "it stays until it is cleared"
 
 
-def test_a_controller_that_finds_nothing_damps_a_walking_robot(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_controller_that_finds_nothing_folds_a_walking_robots_legs(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.walk()
     break_controller(bench, monkeypatch)
-    assert is_damp(bench.tick())
+    command = bench.tick()
+    assert bench.cycle.state.mode is Mode.SIT_DOWN and bench.cycle.state.fault is Reason.BAD_COMMAND
+    assert all(np.isfinite(getattr(command, name)).all() for name in ("position", "velocity", "kp", "kd", "torque"))
+    share = bench.cycle.config.posture.brace_gain
+    np.testing.assert_allclose(command.kp, share * np.tile(bench.cycle.config.control.gains.kp, (4, 1)))
+    bench.reach(Mode.DAMP)
+    assert is_damp(bench.command) and not bench.cycle.state.armed
     assert bench.cycle.state.fault is Reason.BAD_COMMAND
 
 

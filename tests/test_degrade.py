@@ -109,14 +109,22 @@ def test_a_standing_robot_without_imu_sits_down(walk: Walk) -> None:
     assert fastest < 0.8 and leant < 0.2
 
 
-def test_a_walking_robot_without_imu_damps(walk: Walk) -> None:
+def test_a_walking_robot_without_imu_folds_its_legs(walk: Walk) -> None:
     walk.ask(Request.WALK)
     walk.run(1.5, (0.8, 0.0, 0.0))
     spoil(walk, no_imu)
     walk.run(0.01)
     assert walk.cycle.state.mode is Mode.WALK and marks(walk) & Clamp.EXTRAPOLATED
     walk.run(0.005)
-    assert walk.cycle.state.mode is Mode.DAMP and walk.cycle.state.fault is Reason.IMPLAUSIBLE_IMU
+    assert walk.cycle.state.mode is Mode.SIT_DOWN and walk.cycle.state.fault is Reason.IMPLAUSIBLE_IMU
+    peak = np.array(walk.config.robot.joints.peak_torque)
+    gain = walk.config.posture.brace_gain
+    for _ in range(400):
+        walk.run(0.005)
+        assert (walk.command.kp <= gain * 150.0 + 1e-9).all()
+        assert (np.abs(walk.measurement.joints.torque) <= peak * (1 + 1e-9)).all()
+    assert walk.cycle.state.mode is Mode.DAMP and walk.cycle.state.reason is Reason.SAT_DOWN
+    assert not walk.command.kp.any()
 
 
 def test_an_imu_that_misses_samples_is_carried_on(walk: Walk) -> None:

@@ -35,7 +35,10 @@ CARRIED: dict[str, Any] = {
         (CARRIED | {"motors.servo_kd": 51.0, "damp.fall_kd": 9.0}, r"damp.fall_kd\[0\] = 9 N·m·s/rad: .* 8.117"),
         (CARRIED | {"motors.max_torque": [40.0, 400.0, 40.0]}, r"motors.max_torque\[1\] = 400 N·m: .* 327.7"),
         (CARRIED | {"robot.joints.max_velocity": [30.0, 30.0, 60.0]}, r"max_velocity\[2\] = 60 rad/s: .* 51.47"),
-        (CARRIED | {"motors.gear": [1.0, 1.0, 8.0], "robot.joints.max_velocity": [6.0] * 3}, r"upper, .*offset\[0\]\[2\] = 2.753 rad"),
+        (
+            CARRIED | {"motors.gear": [1.0, 1.0, 8.0], "robot.joints.max_velocity": [6.0] * 3},
+            r"upper, .*offset\[0\]\[2\] = 2.753 rad",
+        ),
     ],
 )
 def test_what_the_frames_cannot_carry_is_refused_by_value_bound_and_place(changes: dict, words: str) -> None:
@@ -79,7 +82,6 @@ def test_what_is_let_in_arrives_within_half_a_step(
     position = np.array(joints.upper)[0, 0] + let_in.motors.offset[0][0]
     command = np.tile([position, 0.0, joints.peak_torque[0], *most], (12, 1))
     said = moteus.parse_registers(build_codec(let_in.motors).encode(command)[0]).command
-    half = 0.5 * (1.0 + 1e-9)
     for register, wanted, step in (
         (Register.COMMAND_POSITION, position, 1e-4 * REVOLUTION),
         (Register.COMMAND_TORQUE, joints.peak_torque[0], 0.01),

@@ -34,6 +34,12 @@ class PostureTimes(Protocol):
     def settle_time(self) -> float: ...  # noqa: D102
     @property
     def fold_height(self) -> float: ...  # noqa: D102
+    @property
+    def brace_time(self) -> float: ...  # noqa: D102
+    @property
+    def brace_gain(self) -> float: ...  # noqa: D102
+    @property
+    def brace_damping(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +58,8 @@ class Segment:
     """Share of the gains, at start and end."""
     load: tuple[float, float]
     """Share of the weight that is fed forward, at start and end."""
+    damping: float = 0.0
+    """Share of the damping gain at least."""
 
 
 SEGMENTS = 5
@@ -71,6 +79,7 @@ POSTURE_DTYPE = np.dtype(
         ("feet", "u1", (SEGMENTS,)),
         ("gains", "f8", (SEGMENTS, 2)),
         ("loads", "f8", (SEGMENTS, 2)),
+        ("dampings", "f8", (SEGMENTS,)),
     ],
     align=True,
 )
@@ -165,6 +174,20 @@ class Posture:
             ]
         )
 
+    def brace(self, measurement: Measurement) -> None:
+        """Plan the quick way down of a robot that moves: joint by joint to folded, soft, bearing less and less.
+
+        Needs neither attitude nor contact nor a controller.
+        """
+        q, times = measurement.joints.position, self.times
+        folded, gain, damping = self.folded_joints, times.brace_gain, times.brace_damping
+        self._begin(
+            [
+                Segment(times.brace_time, q, folded, False, (gain, gain), (1.0, 0.0), damping),
+                Segment(times.soft_start, folded, folded, False, (gain, 0.0), (0.0, 0.0), damping),
+            ]
+        )
+
     def step(self) -> JointCommand:
         """The command of this tick; ``finished`` once the last segment is over (its end is then held)."""
         self._elapsed += self.dt
@@ -180,7 +203,8 @@ class Posture:
         self.load = segment.load[0] + smooth * (segment.load[1] - segment.load[0])
         velocity = np.zeros((4, 3)) if self._target is None else (q - self._target) / self.dt
         self._target = q
-        return JointCommand(q.copy(), velocity, self.gain * self.kp, self.gain * self.kd, self._bear(q))
+        damping = max(self.gain, segment.damping)
+        return JointCommand(q.copy(), velocity, self.gain * self.kp, damping * self.kd, self._bear(q))
 
     def remember(self, memory: Records) -> None:
         """Write the movement in progress into ``memory`` () of ``POSTURE_DTYPE``."""
@@ -193,6 +217,7 @@ class Posture:
             memory["duration"][index], memory["feet"][index] = segment.duration, segment.feet
             memory["start"][index], memory["end"][index] = segment.start, segment.end
             memory["gains"][index], memory["loads"][index] = segment.gain, segment.load
+            memory["dampings"][index] = segment.damping
 
     def recall(self, memory: Records) -> None:
         """Go on with the movement that was written into ``memory``."""
@@ -207,6 +232,7 @@ class Posture:
                 bool(memory["feet"][index]),
                 tuple(memory["gains"][index].tolist()),
                 tuple(memory["loads"][index].tolist()),
+                float(memory["dampings"][index]),
             )
             for index in range(int(memory["count"]))
         ]
