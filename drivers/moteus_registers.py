@@ -218,6 +218,8 @@ def _parse_values(data: bytes, offset: int, kind: int, registers: Registers) -> 
     resolution, count = kind >> 2 & 3, kind & 3
     if count == 0:
         count, offset = _varuint(data, offset)
+        if count == 0:
+            raise CorruptFrame(f"moteus frame {data.hex()}: a subframe of no registers at byte {offset - 2}")
     first, offset = _varuint(data, offset)
     if kind & 0x30 == 0x10:
         if count > 64:

@@ -146,7 +146,7 @@ class Served:
 
     async def stand(self) -> None:
         for wish in (Request.ARM, Request.STAND):
-            assert self.daemon.take_request(wish).accepted
+            await self.until(lambda wish=wish: self.daemon.take_request(wish).accepted)
         await self.reach(Mode.STAND)
 
     async def until(self, fact: Callable[[], bool]) -> None:

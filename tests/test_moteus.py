@@ -227,6 +227,12 @@ def test_any_bytes_decode_or_are_called_corrupt(data):
             assert type(reading) is type(codec().decode(VALID_REPLY))
 
 
+def test_a_subframe_of_no_registers_is_corrupt():
+    """The package goes on behind it, in the middle of what was meant to follow."""
+    with pytest.raises(CorruptFrame, match="no registers at byte 0"):
+        parse(bytes.fromhex("10000a2f010000003e000000bf00005040230d302300"))
+
+
 @given(st.data())
 @settings(max_examples=200)
 def test_mutated_frames_agree_with_the_package_where_both_accept(data):

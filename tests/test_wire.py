@@ -120,7 +120,9 @@ def test_an_unreliable_imu_cable_is_resynchronised_within_a_tick(walk: WireWalk)
 def test_an_imu_that_is_pulled_damps_and_put_back_walks_again(walk: WireWalk) -> None:
     into_a_walk(walk)
     walk.unplug()
-    assert walk.ticks_to_damp(velocity=WALKING) <= STALE_TICKS
+    assert walk.ticks_to_leave(Mode.WALK, WALKING) <= STALE_TICKS
+    assert walk.cycle.state.mode is Mode.SIT_DOWN, "the legs fold below it: they still answer"
+    assert walk.ticks_to_damp(200) < 200
     assert "IMU" in walk.faults[0]
     walk.run(1.0)
     walk.plug_in()
@@ -138,7 +140,8 @@ def test_an_imu_that_is_pulled_damps_and_put_back_walks_again(walk: WireWalk) ->
 def test_an_imu_whose_line_overflows_damps_and_says_why(walk: WireWalk) -> None:
     into_a_walk(walk)
     walk.wires.imu.emulator.overflowing = True
-    assert walk.ticks_to_damp(velocity=WALKING) <= STALE_TICKS
+    assert walk.ticks_to_leave(Mode.WALK, WALKING) <= STALE_TICKS
+    assert walk.ticks_to_damp(200) < 200
     assert walk.imu.link.errors[41] >= 1
 
 

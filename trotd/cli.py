@@ -9,7 +9,8 @@ import contextlib
 import logging
 import os
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -108,7 +109,7 @@ def run(
     Example: `trotd run --body sim --robot my.toml --rate-hz 500`
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
-    with _one_line_errors():
+    with _one_line_errors(), _announced() as started:
         from runtime import daemon, policies
         from runtime.state import state_folder
         from trotd.bodies import build_body, lenient
@@ -123,7 +124,6 @@ def run(
 
             config = with_baseline(body, config, place)
         part = build_body(body, config, path, place, observe)
-        logging.getLogger("trotd").info("starting; the first start after an installation compiles for minutes")
         job = daemon.Job(
             config,
             path.read_text(),
@@ -131,7 +131,7 @@ def run(
             part.robot,
             place,
             part.channels,
-            _say_ready,
+            lambda: _say_ready(started),
             simulated=body != "hardware",
             memory=_memory(place),
             policy_file=policy_path.read_bytes(),
@@ -151,7 +151,25 @@ def _memory(state: Path) -> Path | None:
         return None
 
 
-def _say_ready() -> None:
+LONG = 2.0
+"""s that a start may take before it says that it takes long."""
+
+
+@contextlib.contextmanager
+def _announced() -> Iterator[Callable[[], None]]:
+    """Say so when a start takes longer than ``LONG``; what is given ends the wait."""
+    words = "starting; the first start after an installation compiles for minutes"
+    timer = threading.Timer(LONG, lambda: logging.getLogger("trotd").info(words))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield timer.cancel
+    finally:
+        timer.cancel()
+
+
+def _say_ready(started: Callable[[], None]) -> None:
+    started()
     logging.getLogger("trotd").info("ready: in DAMP, waiting to be armed")
 
 

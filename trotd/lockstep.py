@@ -198,6 +198,14 @@ class TwinWalk:
             if self.now > end:
                 raise RuntimeError(f"not standing after {STANDING_UP:g} s: {self.cycle.state}")
 
+    def ticks_to_leave(self, mode: Mode, velocity: tuple[float, float, float], limit: int = 60) -> int:
+        """Ticks until the mode is another than ``mode``; the limit where it stays."""
+        for ticks in range(1, limit + 1):
+            self.tick(velocity if self.cycle.state.mode is Mode.WALK else None)
+            if self.cycle.state.mode is not mode:
+                return ticks
+        return limit
+
     def ticks_to_damp(self, limit: int = 60, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> int:
         """Ticks until the mode is DAMP; the limit where it does not get there."""
         for ticks in range(1, limit + 1):

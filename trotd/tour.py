@@ -130,10 +130,14 @@ def _reach(robot: str, endpoint: str, child: subprocess.Popen[bytes], output: IO
             if child.poll() is not None:
                 kind = DaemonRefused if child.returncode == BAD_INPUT else DaemonFailed
                 raise kind(f"the daemon did not start: {_last_line(output)}")
+            attempt = contextlib.ExitStack()
             try:
-                station = stack.enter_context(connected(robot, endpoint))
+                station = attempt.enter_context(connected(robot, endpoint))
+                station.ask(station.keys.tick_schema)  # it listens before it has compiled what it answers with
+                stack.push(attempt)
                 break
             except StationError:
+                attempt.close()
                 if time.monotonic() > end:
                     raise
                 time.sleep(0.2)
