@@ -6,17 +6,19 @@ cyclictest (Debian's rt-tests) is the measure of what this kernel can do at all.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from station.session import StationError
-from trotd.bench.daemon import PRIORITY, Disturbed, Slice, may_fifo, walking_daemon
+from trotd.bench.daemon import PRIORITY, Disturbed, Slice, Walking, may_fifo, walking_daemon
 from trotd.bench.host import Window, stolen_time, watched
 from trotd.bench.report import Figure, Finding, Missing, shown
 
@@ -98,36 +100,41 @@ def _wakes_missed(lateness: np.ndarray, rate: float) -> int:
 
 
 def listened_to(rate: float, turns: int) -> Iterator[Finding]:
-    """Compute time of a tick with a subscriber of all ticks and without, in turns of ``TURN`` s in one daemon."""
+    """Compute time of a tick with a subscriber of all ticks and without, in turns of ``TURN`` s in one daemon.
+
+    Turns in which the machine's host took processor time do not count.
+    """
     name = f"{rate:g} Hz: a subscriber on or off"
-    stretches: list[tuple[float, bool]] = []
+    calm: dict[bool, list[float]] = {False: [], True: []}
     with walking_daemon(rate, False, round(2 * turns * TURN)) as walking:
         for turn in shown(range(2 * turns), name, 2 * turns):
             on = turn % 4 in (1, 2)  # off on on off: a drift of the machine cancels
-            subscriber = (
-                walking.station.session.declare_subscriber(walking.station.keys.tick, lambda _sample: None)
-                if on
-                else None
-            )
-            time.sleep(SETTLE)
-            stretches.append((time.monotonic(), on))
-            time.sleep(TURN)
-            if subscriber is not None:
-                subscriber.undeclare()  # type: ignore[no-untyped-call]
+            with _subscribed(walking) if on else contextlib.nullcontext():
+                time.sleep(SETTLE)
+                begin, before = time.monotonic(), stolen_time()
+                time.sleep(TURN)
+                if stolen_time() == before:
+                    calm[on].append(begin)
+    if not (calm[False] and calm[True]):
+        yield Missing("timer", name, "the machine's host took time in every turn")
+        return
     whole = walking.read()
-    off, on_ = (
-        float(
-            np.median(
-                [
-                    np.percentile(whole.compute[(whole.stamp > begin) & (whole.stamp < begin + TURN)], 99)
-                    for begin, heard in stretches
-                    if heard is state
-                ]
-            )
-        )
-        for state in (False, True)
-    )
-    yield Figure("timer", f"{name}, tick p99", 100.0 * (on_ / off - 1.0), "%", 5.0, note=f"{off:.0f} and {on_:.0f} µs")
+    off, on_ = (float(np.median([_p99(whole, begin) for begin in calm[heard]])) for heard in (False, True))
+    note = f"{off:.0f} and {on_:.0f} µs, {len(calm[False])} and {len(calm[True])} undisturbed turns"
+    yield Figure("timer", f"{name}, tick p99", 100.0 * (on_ / off - 1.0), "%", 5.0, note=note)
+
+
+@contextlib.contextmanager
+def _subscribed(walking: Walking) -> Iterator[None]:
+    subscriber: Any = walking.station.session.declare_subscriber(walking.station.keys.tick, lambda _sample: None)
+    try:
+        yield
+    finally:
+        subscriber.undeclare()
+
+
+def _p99(whole: Slice, begin: float) -> float:
+    return float(np.percentile(whole.compute[(whole.stamp > begin) & (whole.stamp < begin + TURN)], 99))
 
 
 @dataclass(frozen=True, slots=True)
