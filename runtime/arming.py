@@ -16,7 +16,7 @@ from runtime.control.kinematics import GRAVITY
 from runtime.control.policy import Policy
 from runtime.control.records import Records, VelocityCommand
 from runtime.guard import Guard, joint_name, tilt
-from runtime.messages.mode import ArmingCheck
+from runtime.messages.mode import ArmingCheck, Mode
 from runtime.modes import Reason
 from runtime.parameters import ArmingConfig, LimitsConfig
 
@@ -61,6 +61,8 @@ class Arming:
         ]
 
     def _motors(self, t: np.void) -> Iterator[str]:
+        if t["mode"] != Mode.DAMP:
+            yield "they have not been damped for a tick"
         age, fault = t["joint_age"].ravel(), t["joint_fault"].ravel()
         for index in np.flatnonzero(~(age <= self.limits.max_age)):
             yield f"{joint_name(int(index))} last answered {age[index] * 1e3:.0f} ms ago"

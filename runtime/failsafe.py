@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from runtime.modes import SEATED, WHOLE, WORDS, Reason
 
 LIMITS, PLAUSIBILITY, CYCLE = "tests/test_limits.py", "tests/test_plausibility.py", "tests/test_cycle.py"
-DEGRADE, TORTURE, DAEMON = "tests/test_degrade.py", "tests/test_torture.py", "tests/test_daemon.py"
+ENCODERS, DEGRADE = "tests/test_encoders.py", "tests/test_degrade.py"
+TORTURE, DAEMON = "tests/test_torture.py", "tests/test_daemon.py"
 INJECTED = f"{LIMITS}::test_an_injected_fault_is_named"
 WEAK_MOTOR = f"{PLAUSIBILITY}::test_a_motor_that_does_not_give_what_it_is_told_is_found"
 
@@ -120,21 +121,21 @@ TABLE: tuple[Fault, ...] = (
         Reason.STUCK_ENCODER,
         "encoders.look_at_encoder",
         "`stuck_time`",
-        f"{PLAUSIBILITY}::test_an_encoder_that_stands_still_while_its_leg_moves_is_found",
+        f"{ENCODERS}::test_an_encoder_that_stands_still_while_its_leg_moves_is_found",
     ),
     Fault(
         "an encoder is stuck, in a walk",
         Reason.STUCK_ENCODER,
         "encoders.look_at_encoder",
         "2 to 20",
-        f"{PLAUSIBILITY}::test_an_encoder_that_stands_still_while_its_joint_is_told_to_move_is_found_at_once",
+        f"{ENCODERS}::test_an_encoder_that_stands_still_while_its_joint_is_told_to_move_is_found_at_once",
     ),
     Fault(
         "an encoder is stuck while the robot stands still",
         Reason.STUCK_ENCODER,
         "encoders.look_at_encoder",
         "at the first tilt of `stuck_tilt` or the first step",
-        f"{PLAUSIBILITY}::test_an_encoder_that_stands_still_while_the_robot_tilts_is_found",
+        f"{ENCODERS}::test_an_encoder_that_stands_still_while_the_robot_tilts_is_found",
         "nothing until it shows: its motor holds with the torque that it held with before; then damps",
     ),
     Fault("a motor gives no torque", Reason.TORQUE_LOST, "plausibility.look_at_motor", "0.14 s", WEAK_MOTOR),

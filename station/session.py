@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -134,6 +135,13 @@ class Station:
             raise StationError(f"robot {self.robot!r}: status: {error}") from error
         finally:
             subscriber.undeclare()
+
+
+def free_endpoint() -> str:
+    """A TCP endpoint of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -26,7 +25,7 @@ from runtime.daemon import Daemon, Job
 from runtime.messages.mode import Mode, ModeReply, Request
 from runtime.messages.status import Status
 from runtime.tick_record import Wake
-from station.session import Station, StationError, connected
+from station.session import Station, StationError, connected, free_endpoint
 
 _numbers = itertools.count()
 PATIENCE = 120.0
@@ -52,12 +51,6 @@ QUICK = {
     "audition.trial": 0.2,
     "recorder.after_fault": 0.02,
 }
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def make_config(**changes: Any) -> Config:

@@ -101,6 +101,16 @@ def test_nothing_is_accepted_before_the_first_measurement_was_judged(bench: Benc
     assert not bench.ask(Request.ARM)[0]
 
 
+def test_a_stop_damps_for_a_tick_however_soon_somebody_arms_again(bench: Bench) -> None:
+    bench.walk()
+    assert bench.ask(Request.DAMP)[0]
+    accepted, words = bench.ask(Request.ARM)
+    assert not accepted and "not been damped" in words
+    assert not bench.ask(Request.STAND)[0]
+    assert is_damp(bench.tick())
+    assert bench.ask(Request.ARM)[0] and bench.ask(Request.STAND)[0]
+
+
 def test_up_walk_and_down(bench: Bench) -> None:
     bench.walk()
     assert bench.cycle.tick["mode"][0] == Mode.WALK

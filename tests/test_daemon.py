@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from daemons import PATIENCE, Probe, Served, is_damp, make_config, make_policy
+from daemons import PATIENCE, Probe, Served, is_damp, make_config, make_policy, until
 
 from drivers.errors import BusTimeout, DriverError
 from drivers.robot import Measurement
@@ -315,6 +315,7 @@ def test_an_operator_that_goes_away_stops_the_walk(tmp_path: Path) -> None:
 
         await served.client(come_and_go)
         await served.reach(Mode.STAND)  # the command itself is believed for ten minutes
+        await until(lambda: any("operator is gone" in event.text for event in served.daemon.link.history))
 
     serve(tmp_path, act)
 

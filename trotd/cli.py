@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trotd import cli_bench, cli_hardware, cli_live, cli_ros2, cli_station, cli_study, cli_training
+from trotd.exits import BAD_INPUT, FAILED
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")  # before numpy loads: small matrices are 80 times slower on two threads
 
-FAILED, BAD_INPUT = 1, 2
 
 app = typer.Typer(
     name="trotd",

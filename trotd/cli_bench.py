@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from trotd.bench.command import Section
-
-FAILED = 1
+from trotd.exits import FAILED
 
 
 def register(app: typer.Typer) -> None:

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-FAILED, BAD_INPUT = 1, 2
+from trotd.exits import BAD_INPUT, FAILED
+
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="A shipped robot's name, or a .toml file.")]
 StateOption = Annotated[Path | None, typer.Option("--state", help="Folder of calibration and lock.", file_okay=False)]
 BodyOption = Annotated[str, typer.Option(help="hardware: the robot. twin: its stand-in, which trotd twin starts.")]

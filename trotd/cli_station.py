@@ -10,14 +10,13 @@ from typing import Annotated
 
 import typer
 
+from trotd.exits import BAD_INPUT, FAILED, INTERRUPTED
+
 ENDPOINT = "tcp/127.0.0.1:7447"
 
 app = typer.Typer(no_args_is_help=True)
 RobotOption = Annotated[str, typer.Option("--robot", help="A shipped robot's name or a .toml file.")]
 ConnectOption = Annotated[str, typer.Option("--connect", help="Where the daemon listens.")]
-
-
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
 class UsageError(ValueError):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trotd.cli_station import ENDPOINT
+from trotd.exits import BAD_INPUT, FAILED, INTERRUPTED
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -24,7 +25,6 @@ policy_app = typer.Typer(no_args_is_help=True, help="Look at policies.")
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="A shipped robot's name, or a .toml file.")]
 WorkersOption = Annotated[int, typer.Option(help="Worker processes; 0 for every core.", min=0)]
 QUICK_TESTS = ("velocity, noisy", "push sideways", "push forward", "start at U[0, π/6]", "task draws")
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
 def register(app: typer.Typer) -> None:

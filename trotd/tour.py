@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -21,15 +20,14 @@ from rich.text import Text
 
 from runtime.config import Config
 from runtime.messages.status import Status
-from station.session import Station, StationError, connected
+from station.session import Station, StationError, connected, free_endpoint
 from station.tour import Tour, TourReport
+from trotd.exits import BAD_INPUT
 from trotd.wire import MEETING, twin_folder
 
 START_TIMEOUT = 180.0
 """s; the first start of all compiles the core."""
 STOP_TIMEOUT = 15.0
-BAD_INPUT = 2
-"""The exit code by which a daemon says so."""
 
 
 class DaemonFailed(StationError):
@@ -49,8 +47,7 @@ def take_tour(config: Config, arguments: Sequence[str], as_json: bool, wire: boo
         StationError: the daemon does not start.
     """
     console = Console(stderr=as_json)
-    with _free_endpoint() as endpoint:
-        pass
+    endpoint = free_endpoint()
     with contextlib.ExitStack() as stack:
         body = "sim"
         if wire:
@@ -113,13 +110,6 @@ def running_twin(robot: str, endpoint: str, arguments: Sequence[str]) -> Iterato
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
-
-
-@contextlib.contextmanager
-def _free_endpoint() -> Iterator[str]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        yield f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @contextlib.contextmanager

@@ -6,7 +6,6 @@ import contextlib
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -20,12 +19,13 @@ import msgspec
 import psutil
 
 from runtime import config
-from runtime.messages.mode import Mode, ModeReply, Request
+from runtime.messages.mode import Mode, Request
 from runtime.messages.simulation import SimTruth
 from station.driving import Driving
 from station.joystick import Joystick
 from station.pad import Sticks
-from station.session import Station, StationError, connected
+from station.requests import request, set_off
+from station.session import Station, StationError, connected, free_endpoint
 from trotd.tour import running_twin
 
 SETTLING = 0.1
@@ -112,7 +112,7 @@ def work(minutes: float, robot: str, body: str, rate_hz: float, watched: bool, s
     """
     shift = Shift(minutes=minutes, rate_hz=rate_hz, ends=[], clients={})
     with tempfile.TemporaryDirectory(prefix="trotd-soak-") as place, contextlib.ExitStack() as stack:
-        folder, endpoint = Path(place), _free_endpoint()
+        folder, endpoint = Path(place), free_endpoint()
         arguments = ["--robot", robot, "--rate-hz", f"{rate_hz:g}", "--state", str(folder)]
         if body == "twin":
             name = config.load(config.find_robot(robot)).robot.name
@@ -120,7 +120,7 @@ def work(minutes: float, robot: str, body: str, rate_hz: float, watched: bool, s
         command = ["run", "--body", body, "--listen", endpoint, *arguments]
         daemon = stack.enter_context(_process(folder, "daemon", command))
         station = stack.enter_context(_reached(robot, endpoint, daemon))
-        _stand_and_walk(station)
+        set_off(station)
         watchers = (["monitor", "--json", "--hz", "2"], ["view", "--save", os.devnull]) if watched else ()
         clients = {
             words[0]: stack.enter_context(_process(folder, words[0], [*words, "--robot", robot, "--connect", endpoint]))
@@ -129,7 +129,7 @@ def work(minutes: float, robot: str, body: str, rate_hz: float, watched: bool, s
         _drive(station, daemon, shift, show)
         for name, client in clients.items():
             shift.clients[name] = "" if client.poll() is None else f"ended with code {client.returncode}"
-        station.ask(station.keys.mode, Request.DAMP.value.encode())
+        request(station, Request.DAMP)
         daemon.send_signal(signal.SIGTERM)
         shift.recording = daemon.wait(60.0) == 0 and any(folder.rglob("*-stop.trotd"))
     return shift
@@ -189,19 +189,6 @@ def _drive(station: Station, daemon: subprocess.Popen[bytes], shift: Shift, show
         shift.ends.append(f"the daemon ended with code {daemon.returncode}")
 
 
-def _stand_and_walk(station: Station) -> None:
-    time.sleep(1.5)  # it lies down first
-    for wish, mode in ((Request.ARM, Mode.DAMP), (Request.STAND, Mode.STAND), (Request.WALK, Mode.WALK)):
-        end = time.monotonic() + 60.0
-        while not (reply := station.ask_for(ModeReply, station.keys.mode, wish.value.encode())).accepted:
-            if time.monotonic() > end:
-                raise StationError(f"{wish.value}: {reply.reason}")
-            time.sleep(0.2)  # a busy machine is not punctual at once
-        while station.next_status(10.0).mode != mode.name:
-            if time.monotonic() > end:
-                raise StationError(f"the robot did not come into {mode.name}")
-
-
 @contextlib.contextmanager
 def _process(folder: Path, name: str, words: list[str]) -> Iterator[subprocess.Popen[bytes]]:
     """``trotd`` with ``words``, its output in ``folder``; killed at the end if it is still there."""
@@ -237,12 +224,6 @@ def _reached(robot: str, endpoint: str, daemon: subprocess.Popen[bytes]) -> Iter
                     raise
                 time.sleep(0.2)
         yield station
-
-
-def _free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def missed_share(shift: Shift) -> float:

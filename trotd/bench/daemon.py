@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +20,8 @@ from runtime import config
 from runtime.control.records import Records
 from runtime.recording import SUFFIX, load
 from station.requests import set_off
-from station.session import NoAnswer, Station, StationError, connected
+from station.session import NoAnswer, Station, StationError, connected, free_endpoint
+from trotd.bench.host import Window
 
 ROBOT = "stoch3"
 PRIORITY = 80
@@ -47,6 +47,14 @@ class Slice:
     """Deadlines that have gone by without a tick of their own, counted at each tick."""
     records: Records
     """All of the recording, what did not walk too."""
+
+    def within(self, window: Window) -> np.ndarray:
+        """Which ticks fell into ``window``. Shape (n,), bool."""
+        return (self.stamp >= window.begin) & (self.stamp < window.end)
+
+    def p99(self, windows: Sequence[Window]) -> float:
+        """Of the compute time: the median over ``windows`` of each one's 99th percentile, µs."""
+        return float(np.median([np.percentile(self.compute[self.within(window)], 99) for window in windows]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,13 +174,6 @@ def _driven(station: Station, steered: bool) -> Iterator[None]:
     finally:
         done.set()
         talker.join()
-
-
-def free_endpoint() -> str:
-    """A TCP endpoint of this machine that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def may_fifo() -> bool:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
+Kind = TypeVar("Kind")
 WINDOW = 1.0
 """s in which the host took time or took none."""
 STEAL = 8
@@ -36,11 +39,22 @@ def stolen_time() -> float:
     return int(total[STEAL]) / os.sysconf("SC_CLK_TCK")
 
 
-def watched(seconds: float) -> list[Window]:
-    """Sleep for ``seconds``; what the host took meanwhile, in windows of ``WINDOW`` s."""
+def watched(seconds: float) -> Window:
+    """Sleep for ``seconds``; what the host took meanwhile."""
+    begin, before = time.monotonic(), stolen_time()
+    time.sleep(seconds)
+    return Window(begin, time.monotonic(), stolen_time() - before)
+
+
+def watched_in_windows(seconds: float) -> list[Window]:
+    """The same in windows of ``WINDOW`` s."""
     windows, end = [], time.monotonic() + seconds
-    while (begin := time.monotonic()) < end:
-        before = stolen_time()
-        time.sleep(min(WINDOW, end - begin))
-        windows.append(Window(begin, time.monotonic(), stolen_time() - before))
+    while (left := end - time.monotonic()) > 0.0:
+        windows.append(watched(min(WINDOW, left)))
     return windows
+
+
+def calm_or_all(kinds: Mapping[Kind, list[Window]]) -> tuple[dict[Kind, list[Window]], str]:
+    """The calm windows of each kind, or all of them where a kind has none that is calm; and in a word, which."""
+    calm = {kind: [window for window in windows if window.calm] for kind, windows in kinds.items()}
+    return (calm, "undisturbed") if all(calm.values()) else (dict(kinds), "disturbed")

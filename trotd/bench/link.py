@@ -38,10 +38,10 @@ from runtime.policies import find_policy, load
 from runtime.shelf import PolicyFile
 from runtime.status import build_status
 from station.requests import set_off
-from station.session import Station
-from trotd.bench.daemon import ROBOT, Walking, free_endpoint, may_fifo, walking_daemon
-from trotd.bench.host import stolen_time
-from trotd.bench.report import Figure, Finding, Missing, shown
+from station.session import Station, free_endpoint
+from trotd.bench.daemon import ROBOT, Walking, may_fifo, walking_daemon
+from trotd.bench.host import Window, calm_or_all, watched
+from trotd.bench.report import Figure, Finding, shown
 
 RATE = 200.0
 QUICK_POSTURE = (
@@ -201,48 +201,36 @@ async def _turns() -> None:
 def looked_on(rounds: int) -> Iterator[Finding]:
     """Compute time of a tick with viewer, monitor and a recording being written, or without, in turns in one daemon.
 
-    Then both lookers-on are stopped (SIGSTOP) in the middle of it all: neither ticks nor memory may show it.
+    Then both lookers-on are stopped (SIGSTOP) in the middle of it all: neither ticks nor memory may show it. Turns in
+    which the machine's host took processor time do not count, unless it did in all of one kind.
     """
-    stretches: dict[str, list[float]] = {"off": [], "on": [], "stuck": []}
+    every: dict[str, list[Window]] = {"off": [], "on": [], "stuck": []}
     grown: list[float] = []
     with walking_daemon(RATE, may_fifo(), round(2 * rounds * (3 * TURN + COME))) as walking:
         for number in shown(range(2 * rounds), "viewer and monitor on or off", 2 * rounds):
             if number % 2:
-                stretches["off"] += _stretch()
+                every["off"].append(watched(TURN))
             with tempfile.TemporaryDirectory() as folder, _lookers(walking, Path(folder)) as lookers:
                 _write_recording(walking.station)
-                stretches["on"] += _stretch()
+                every["on"].append(watched(TURN))
                 for looker in lookers:
                     looker.send_signal(signal.SIGSTOP)
                 before = _resident(walking.process)
-                stretches["stuck"] += _stretch()
+                every["stuck"].append(watched(TURN))
                 grown.append(_resident(walking.process) - before)
                 for looker in lookers:
                     looker.send_signal(signal.SIGCONT)
             if not number % 2:
-                stretches["off"] += _stretch()
-    if not all(stretches.values()):
-        yield Missing("link", "viewer, monitor, recorder", "the machine's host took time in every turn")
-        return
+                every["off"].append(watched(TURN))
     whole = walking.read()
-    p99 = {name: float(np.median([_p99(whole, begin) for begin in begins])) for name, begins in stretches.items()}
+    used, word = calm_or_all(every)
+    p99 = {name: whole.p99(windows) for name, windows in used.items()}
     for name, words in (("on", "viewer, monitor, recorder"), ("stuck", "both stopped")):
-        turns = f"{len(stretches['off'])} and {len(stretches[name])} undisturbed turns"
-        note = f"{p99['off']:.0f} without, {p99[name]:.0f} µs with, {turns}"
+        note = (
+            f"{p99['off']:.0f} without, {p99[name]:.0f} µs with, {len(used['off'])} and {len(used[name])} {word} turns"
+        )
         yield Figure("link", f"{words}: tick p99", 100.0 * (p99[name] / p99["off"] - 1.0), "%", 5.0, note=note)
     yield Figure("link", "both stopped: the daemon's memory", max(grown), "MB", 20.0, note=f"grown in {TURN:g} s")
-
-
-def _p99(whole: Any, begin: float) -> float:
-    inside = (whole.stamp > begin) & (whole.stamp < begin + TURN)
-    return float(np.percentile(whole.compute[inside], 99))
-
-
-def _stretch() -> list[float]:
-    """Let a turn go by; when it began, or nothing where the machine's host took processor time in it."""
-    begin, before = time.monotonic(), stolen_time()
-    time.sleep(TURN)
-    return [begin] if stolen_time() == before else []
 
 
 def _write_recording(station: Station) -> None:

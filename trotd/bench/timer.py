@@ -19,7 +19,7 @@ import numpy as np
 
 from station.session import StationError
 from trotd.bench.daemon import PRIORITY, Disturbed, Slice, Walking, may_fifo, walking_daemon
-from trotd.bench.host import Window, stolen_time, watched
+from trotd.bench.host import Window, calm_or_all, stolen_time, watched, watched_in_windows
 from trotd.bench.report import Figure, Finding, Missing, shown
 
 RATES = (200.0, 500.0, 1000.0)
@@ -105,24 +105,17 @@ def listened_to(rate: float, turns: int) -> Iterator[Finding]:
     Turns in which the machine's host took processor time do not count, unless it did in all of one kind.
     """
     name = f"{rate:g} Hz: a subscriber on or off"
-    calm: dict[bool, list[float]] = {False: [], True: []}
-    every: dict[bool, list[float]] = {False: [], True: []}
+    every: dict[bool, list[Window]] = {False: [], True: []}
     with walking_daemon(rate, False, round(2 * turns * TURN)) as walking:
         for turn in shown(range(2 * turns), name, 2 * turns):
             on = turn % 4 in (1, 2)  # off on on off: a drift of the machine cancels
             with _subscribed(walking) if on else contextlib.nullcontext():
                 time.sleep(SETTLE)
-                begin, before = time.monotonic(), stolen_time()
-                time.sleep(TURN)
-                every[on].append(begin)
-                if stolen_time() == before:
-                    calm[on].append(begin)
-    if not (calm[False] and calm[True]):
-        calm = every
+                every[on].append(watched(TURN))
     whole = walking.read()
-    off, on_ = (float(np.median([_p99(whole, begin) for begin in calm[heard]])) for heard in (False, True))
-    kind = "disturbed" if calm is every else "undisturbed"
-    note = f"{off:.0f} and {on_:.0f} µs, {len(calm[False])} and {len(calm[True])} {kind} turns"
+    used, word = calm_or_all(every)
+    off, on_ = whole.p99(used[False]), whole.p99(used[True])
+    note = f"{off:.0f} and {on_:.0f} µs, {len(used[False])} and {len(used[True])} {word} turns"
     yield Figure("timer", f"{name}, tick p99", 100.0 * (on_ / off - 1.0), "%", 5.0, note=note)
 
 
@@ -133,10 +126,6 @@ def _subscribed(walking: Walking) -> Iterator[None]:
         yield
     finally:
         subscriber.undeclare()
-
-
-def _p99(whole: Slice, begin: float) -> float:
-    return float(np.percentile(whole.compute[(whole.stamp > begin) & (whole.stamp < begin + TURN)], 99))
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +142,7 @@ class Calm:
 def run_daemon(rate: float, fifo: bool, seconds: int) -> tuple[Calm, int]:
     """A daemon of its own, walking on the null body for ``seconds``: its undisturbed part, and windows in all."""
     with walking_daemon(rate, fifo, seconds) as walking:
-        windows = watched(seconds)
+        windows = watched_in_windows(seconds)
     return undisturbed(walking.read(), windows), len(windows)
 
 
@@ -161,7 +150,7 @@ def undisturbed(whole: Slice, windows: list[Window]) -> Calm:
     """The ticks of those windows that are calm."""
     lateness, missed, calm = [np.empty(0)], 0, [window for window in windows if window.calm]
     for window in calm:
-        inside = (whole.stamp >= window.begin) & (whole.stamp < window.end)
+        inside = whole.within(window)
         lateness.append(whole.lateness[inside])
         overruns = whole.overruns[inside]
         missed += int(overruns[-1] - overruns[0]) if len(overruns) else 0
