@@ -7,35 +7,22 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from math import copysign
 from typing import Any
 
 import numpy as np
 
 from drivers.description import JointLimits
-from drivers.robot import JointCommand
-from sim.sensing import motor_law
-
-STICKING_SPEED = 0.1
-"""Dry friction grows linearly up to this joint speed, rad/s: a hard sign would chatter, and a constraint in the physics
-engine would cost as much as the rest of the step."""
-
+from drivers.robot import Array, JointCommand
+from sim.sensing import STICKING_SPEED, motor_law
 
 Encoder = Callable[[float, float], tuple[float, float]]
 """From a joint's position rad and velocity rad/s to what its servo reads instead."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Law:
-    """A command as the motors run it: torque = constant - kp q - kd q̇, twelve numbers each."""
-
-    constant: list[float]
-    kp: list[float]
-    kd: list[float]
-
-
-_LIMP = _Law([0.0] * 12, [0.0] * 12, [0.0] * 12)
+_LIMP = np.zeros((3, 12))
+FOREVER = 2**62
 
 
 class Motors:
@@ -44,12 +31,14 @@ class Motors:
     def __init__(self, limits: JointLimits) -> None:
         self._limits = limits
         self._friction = limits.friction_torque
-        self.peak: list[float] = []
+        self.peak: Array = np.empty(12)
         """Knob: torque that each joint's motor reaches, N·m; 0 where none arrives at the joint."""
         self.encoders: dict[int, Encoder] = {}
         """Knob: joints (0 to 11) whose servo misreads its shaft: its own loop and its reports believe this."""
         self.reversed: set[int] = set()
         """Knob: joints whose motor turns the other way than it is asked."""
+        self.watched = False
+        """Knob: every physics step passes through ``drive``, for somebody who looks at it."""
         self.reset(1.0, 0)
 
     def reset(self, strength: float, delay: int) -> None:
@@ -59,12 +48,12 @@ class Motors:
             strength: share of the peak torque that the motors reach.
             delay: physics steps between a command's arrival and its effect.
         """
-        self.peak = [strength * peak for peak in self._limits.peak_torque] * 4
+        self.peak = np.array([strength * peak for peak in self._limits.peak_torque] * 4)
         self.encoders, self.reversed = {}, set()
         self._delay = delay
-        self._law = _LIMP
-        self._pending: deque[tuple[int, _Law]] = deque()
-        self.torque = [0.0] * 12
+        self._law: Array = _LIMP
+        self._pending: deque[tuple[int, Array]] = deque()
+        self.torque: Sequence[float] | Array = [0.0] * 12
         """What the motors exert on the joints since the last physics step, N·m."""
 
     def take(self, command: JointCommand, step: int) -> None:
@@ -75,6 +64,18 @@ class Motors:
         """
         self._pending.append((step + self._delay, _law(command)))
 
+    @property
+    def plain(self) -> bool:
+        """Whether the torque is the law's within its peak and nothing else, and nobody looks at it."""
+        return not (self.encoders or self.reversed or self.watched)
+
+    def law_at(self, step: int) -> tuple[Array, int]:
+        """The law of physics step ``step`` and the first step that has another. Shape (3, 12), see ``motor_law``."""
+        pending = self._pending
+        while pending and pending[0][0] <= step:
+            self._law = pending.popleft()[1]
+        return self._law, pending[0][0] if pending else FOREVER
+
     def drive(self, step: int, states: Sequence[Any]) -> list[float]:
         """Torque on each joint in physics step ``step``, motor and dry friction together, N·m.
 
@@ -82,21 +83,20 @@ class Motors:
             step: counted from the reset.
             states: position rad and velocity rad/s of each joint, as the first two entries of twelve tuples.
         """
-        while self._pending and self._pending[0][0] <= step:
-            self._law = self._pending.popleft()[1]
-        law = self._law
+        law, _ = self.law_at(step)
         read = self.read(states) if self.encoders else states
-        self.torque = [
+        exerted = [
             torque if -peak < (torque := c - p * state[0] - d * state[1]) < peak else copysign(peak, torque)
-            for state, c, p, d, peak in zip(read, law.constant, law.kp, law.kd, self.peak, strict=True)
+            for state, c, p, d, peak in zip(read, *law.tolist(), self.peak.tolist(), strict=True)
         ]
         for joint in self.reversed:
-            self.torque[joint] = -self.torque[joint]
+            exerted[joint] = -exerted[joint]
+        self.torque = exerted
         friction, bound = self._friction, STICKING_SPEED
         slope = friction / bound
         return [
             torque - (speed * slope if -bound < (speed := state[1]) < bound else copysign(friction, speed))
-            for torque, state in zip(self.torque, states, strict=True)
+            for torque, state in zip(exerted, states, strict=True)
         ]
 
     @property
@@ -117,9 +117,9 @@ class Motors:
         return [-torque if joint in self.reversed else torque for joint, torque in enumerate(self.torque)]
 
 
-def _law(command: JointCommand) -> _Law:
+def _law(command: JointCommand) -> Array:
     law = np.empty((3, 12))
     if not motor_law(command.position, command.velocity, command.kp, command.kd, command.torque, law):
         names = [item.name for item in fields(command) if not np.isfinite(getattr(command, item.name)).all()]
         raise ValueError(f"joint command {', '.join(names) or 'torque'}: not finite")
-    return _Law(*law.tolist())
+    return law

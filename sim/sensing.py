@@ -12,6 +12,9 @@ import numpy as np
 
 GRAVITY = 9.81
 """m/s²."""
+STICKING_SPEED = 0.1
+"""Dry friction grows linearly up to this joint speed, rad/s: a hard sign would chatter, and a constraint in the physics
+engine would cost as much as the rest of the step."""
 RAW = 49
 """[joint position 12, velocity 12, motor torque 12, centre of mass 3, orientation x y z w 4, its velocity 3, rate 3],
 as the engine gives them: world frame, its own frame of the trunk."""

@@ -6,6 +6,7 @@ Everything here refers to the body's origin, the centre of the four hips. The en
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +108,8 @@ class World:
         self._scenario = scenario
         self._pushes = list(scenario.pushes)
         self.motors.reset(scenario.motor_strength, round(scenario.extra_delay / self._dt))
-        self._states = self._robot.states()
+        self._robot.look()
+        self._robot.raw[24:36] = 0.0
         self._body = np.zeros(BODY)
         self._body[VELOCITY] = scenario.velocity
         self._sensors.reset(scenario.noise, scenario.seed)
@@ -127,9 +129,10 @@ class World:
         first = self._ticks * self.substeps
         self.motors.take(command, first)
         measurement = self._measurement
-        torques = self._physics_steps(first)
+        torques = np.empty((self.substeps, 12))
+        self._physics_steps(first, torques)
         self._ticks += 1
-        self._sensors.warm(np.array(torques).reshape(self.substeps, 12), self.period)
+        self._sensors.warm(torques, self.period)
         self._measurement = self._sense()
         return measurement
 
@@ -157,7 +160,7 @@ class World:
         """
         self._held = from_rpy(rpy), joint_position
         self._keep_held(joint_position)
-        self._states = self._robot.states()
+        self._robot.look()
 
     def set_down(self) -> None:
         """End ``hold``: the robot is again where its last ``reset`` put it."""
@@ -206,20 +209,44 @@ class World:
         """Release the simulator. Harmless when repeated."""
         self._engine.close()
 
-    def _physics_steps(self, first: int) -> list[float]:
-        """A tick of the motors' law and the physics, from physics step ``first`` on. Returns every torque exerted."""
-        robot, motors, advance = self._robot, self.motors, self._engine.step
-        torques: list[float] = []
-        for index in range(first, first + self.substeps):
-            robot.drive(motors.drive(index, self._states))
-            if self._pushes:
-                self._apply_pushes((index + 0.5) * self._dt)
-            if self._held is not None:
-                self._keep_held(self._held[1])
-            advance()
-            self._states = robot.states()
-            torques += motors.torque
-        return torques
+    def _physics_steps(self, first: int, torques: Array) -> None:
+        """A tick of the motors' law and the physics, from physics step ``first`` on; every torque goes into a row."""
+        end = first + self.substeps
+        if not (self._robot.direct and self.motors.plain and self._held is None and not self._pushed(first, end)):
+            for index in range(first, end):
+                torques[index - first] = self._physics_step(index)
+            self._robot.look()
+            return
+        index = first
+        while index < end:
+            law, changes = self.motors.law_at(index)
+            stop = min(changes, end)
+            self._robot.run(law, self.motors.peak, torques[index - first : stop - first])
+            index = stop
+        self.motors.torque = torques[-1]
+
+    def _physics_step(self, index: int) -> Sequence[float] | Array:
+        """One physics step with everything that may happen in it; ``Multibody.run`` does the plain ones."""
+        robot, motors = self._robot, self.motors
+        robot.drive(motors.drive(index, self._states()))
+        if self._pushes:
+            self._apply_pushes((index + 0.5) * self._dt)
+        if self._held is not None:
+            self._keep_held(self._held[1])
+        self._engine.step()
+        robot.look(whole=False)
+        robot.raw[24:36] = motors.torque
+        return motors.torque
+
+    def _states(self) -> list[tuple[float, float]]:
+        """Position rad and velocity rad/s of each joint."""
+        raw = self._robot.raw
+        return list(zip(raw[:12].tolist(), raw[12:24].tolist(), strict=True))
+
+    def _pushed(self, first: int, end: int) -> bool:
+        """Whether a push may act in these physics steps."""
+        start, stop = first * self._dt, end * self._dt
+        return any(push.start <= stop and push.start + push.duration >= start for push in self._pushes)
 
     def _keep_held(self, joint_position: Array | None) -> None:
         assert self._held is not None
@@ -233,20 +260,15 @@ class World:
                 self._robot.push(push)
 
     def _sense(self) -> Measurement:
-        robot, states = self._robot, self._states
-        position, orientation, linear, angular = robot.base()
-        raw = np.array([
-            *[state[0] for state in states], *[state[1] for state in states], *self.motors.torque,
-            *position, *orientation, *linear, *angular,
-        ])  # fmt: skip
+        robot = self._robot
         before, self._body, self._exact = self._body[VELOCITY], np.empty(BODY), np.empty(READINGS)
-        read_body(raw, robot.com, robot.principal, before, self.period, self._body, self._exact)
+        read_body(robot.raw, robot.com, robot.principal, before, self.period, self._body, self._exact)
         return self._sensors.read(self.time, self._misread(self._exact) if self.motors.misreads else self._exact)
 
     def _misread(self, exact: Array) -> Array:
         """What the servos believe of their joints, and the truth of the rest."""
         read = exact.copy()
-        read[:24] = np.array(self.motors.read(self._states)).T.ravel()
+        read[:24] = np.array(self.motors.read(self._states())).T.ravel()
         read[24:36] = self.motors.reported()
         return read
 
@@ -276,7 +298,7 @@ class World:
     def _build(self, terrain: Terrain) -> None:
         self._engine.clear(self._dt)
         self._ground = Ground(self._engine, terrain)
-        self._robot = Multibody(self._engine, self._urdf)
+        self._robot = Multibody(self._engine, self._urdf, self.description.joints.friction_torque)
         self._built = terrain
 
     def _origin(self, scenario: Scenario, rotation: Array, joint_position: Array) -> Array:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import _ctypes
 import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +16,11 @@ import pytest
 from worlds import FIELD, HEIGHT, STOCH3, stoch3_world, trot_in_place
 
 import sim
+from sim.bullet.native import find_client
 from sim.errors import PhysicsError, SimulatorMissing
 from sim.scenario import Noise, Push, Scenario
 from sim.terrain import Slope, Steps
+from sim.truth import Truth
 from sim.world import World
 
 
@@ -49,6 +53,25 @@ def test_the_same_scenario_gives_the_same_bits_whatever_came_before(world: World
         run = trot_in_place(world, SCENARIOS[index], 120)
         np.testing.assert_array_equal(run, fresh[index], err_msg=f"scenario {index} after {order[:length]}")
     assert len({run.tobytes() for run in fresh}) == len(SCENARIOS)
+
+
+def test_physics_steps_in_compiled_code_have_the_bits_of_pybullets_module(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sim.bullet.engine.find_client", lambda library, client: 0)  # as in a build without symbols
+    plain = World(STOCH3, 200.0, HEIGHT)
+    assert world._robot.direct and not plain._robot.direct
+    for scenario in SCENARIOS:
+        runs = [trot_in_place(each, scenario, 120) for each in (world, plain)]
+        np.testing.assert_array_equal(*runs)
+        for field in fields(Truth):
+            truths = [getattr(each.truth, field.name) for each in (world, plain)]
+            np.testing.assert_array_equal(*truths, err_msg=field.name)
+    plain.close()
+
+
+def test_a_library_without_pybullets_symbols_has_no_client() -> None:
+    assert find_client(Path(_ctypes.__file__), 0) == 0
 
 
 def test_close_releases_the_physics_client() -> None:

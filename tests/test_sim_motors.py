@@ -13,7 +13,8 @@ from hypothesis.extra.numpy import arrays
 
 from drivers.robot import JointCommand, JointState, damp_command, motor_torque
 from runtime.config import ROBOTS, load
-from sim.motors import STICKING_SPEED, Motors
+from sim.motors import Motors
+from sim.sensing import STICKING_SPEED
 
 LIMITS = load(ROBOTS / "stoch3.toml").robot.joints
 SMOOTH = msgspec.structs.replace(LIMITS, friction_torque=0.0)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import platform
+from pathlib import Path
 from typing import Any
 
+from sim.bullet.native import find_client
 from sim.errors import SimulatorMissing
 from sim.quiet import silenced
 from sim.sensing import GRAVITY
@@ -23,10 +25,13 @@ class Engine:
         """PyBullet's module."""
         self.client = -1
         """Its number for us; negative while there is none."""
+        self.address = 0
+        """Where it lies, for ``native``; 0 where PyBullet does not tell."""
 
     def connect(self) -> None:
         """Start a simulation of our own."""
         self.client = self.bullet.connect(self.bullet.DIRECT)
+        self.address = find_client(Path(self.bullet.__file__), self.client)
 
     def clear(self, dt: float) -> None:
         """Remove every body, so that what is built depends on nothing that was; physics steps of ``dt`` s follow."""

@@ -1,7 +1,7 @@
 """The robot as the engine keeps it: a base with links.
 
 PyBullet's frame of the base is its centre of mass along its principal axes. What this file takes and gives refers to
-the body's origin, the centre of the four hips, except ``base``, which is raw.
+the body's origin, the centre of the four hips, except ``raw``.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from drivers.robot import JOINTS, LEGS, Array
 from sim.bullet.engine import Engine
+from sim.bullet.native import RUN_DTYPE, look, run
 from sim.errors import PhysicsError
 from sim.model import PAYLOAD, Model
 from sim.rotation import from_xyzw, to_quaternion
 from sim.scenario import Push
+from sim.sensing import STICKING_SPEED
 
 JOINT_NAMES = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
 
@@ -26,8 +28,8 @@ JOINT_NAMES = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
 class Multibody:
     """One robot in an engine, until the engine is cleared."""
 
-    def __init__(self, engine: Engine, urdf: str) -> None:
-        """Load the robot with free joints and no damping."""
+    def __init__(self, engine: Engine, urdf: str, friction: float) -> None:
+        """Load the robot with free joints and no damping; ``friction`` is what ``run`` takes for the motors', N·m."""
         self.bullet = engine.bullet
         self._client = engine.client
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
@@ -46,6 +48,16 @@ class Multibody:
         info = self.bullet.getDynamicsInfo(self._robot, -1, physicsClientId=self._client)
         self.com, self.principal = np.array(info[3]), from_xyzw(info[4])
         """Centre of mass in the body frame, m, (3,); rotation from the base's frame to the body's, (3, 3)."""
+        self.direct = engine.address != 0
+        """Whether ``run`` may be called."""
+        self._memory = np.zeros(RUN_DTYPE.itemsize, np.uint8)
+        record = self._memory.view(RUN_DTYPE)[0]
+        record["client"], record["body"] = engine.address, self._robot
+        record["friction"], record["sticking_speed"] = friction, STICKING_SPEED
+        record["position_index"] = [infos[joint][3] for joint in self._joints]
+        record["velocity_index"] = [infos[joint][4] for joint in self._joints]
+        self.raw: Array = record["raw"]
+        """The state that was looked at last, as ``sensing.RAW`` says; the torques are ``run``'s or the caller's."""
 
     def check_inertia(self, model: Model) -> None:
         """Compare with ``model``: PyBullet zeroes an inertia that it does not believe and only prints a warning.
@@ -60,10 +72,39 @@ class Multibody:
                     f"link {body.name}: PyBullet turned its inertia into {inertia}; it breaks the triangle rule"
                 )
 
-    def states(self) -> Sequence[Any]:
-        """Position, velocity and more of the twelve joints."""
-        states: Sequence[Any] = self.bullet.getJointStates(self._robot, self._joints, physicsClientId=self._client)
-        return states
+    def look(self, whole: bool = True) -> None:
+        """Bring ``raw`` up to date, all but the torques; where not ``whole``, at least the joints.
+
+        Raises:
+            PhysicsError: the engine does not answer.
+        """
+        if self.direct:
+            self._check(look(self._memory))
+            return
+        raw = self.raw
+        states = self.bullet.getJointStates(self._robot, self._joints, physicsClientId=self._client)
+        raw[:24] = [state[0] for state in states] + [state[1] for state in states]
+        if whole:
+            position, orientation = self.bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._client)
+            linear, angular = self.bullet.getBaseVelocity(self._robot, physicsClientId=self._client)
+            raw[36:] = *position, *orientation, *linear, *angular
+
+    def run(self, law: Array, peak: Array, torques: Array) -> None:
+        """Physics steps without Python between them, with the bits of ``drive``, ``Engine.step`` and ``look``.
+
+        Args:
+            law: as ``sensing.motor_law`` gives it. Shape (3, 12).
+            peak: torque that each motor reaches, N·m. Shape (12,).
+            torques: filled with what the motors exerted, N·m; a row is a physics step. Shape (n, 12).
+
+        Raises:
+            PhysicsError: the engine does not answer.
+        """
+        self._check(run(self._memory, law, peak, torques))
+
+    def _check(self, answered: bool) -> None:
+        if not answered:
+            raise PhysicsError("PyBullet does not tell the robot's state")
 
     def drive(self, torque: Sequence[float]) -> None:
         """Torque of the twelve joints in the next physics step, N·m."""
@@ -71,12 +112,6 @@ class Multibody:
         bullet.setJointMotorControlArray(
             self._robot, self._joints, bullet.TORQUE_CONTROL, forces=torque, physicsClientId=self._client
         )
-
-    def base(self) -> tuple[Any, Any, Any, Any]:
-        """Position, orientation x y z w, velocity and rate of the base in the engine's frame; world frame."""
-        position, orientation = self.bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._client)
-        linear, angular = self.bullet.getBaseVelocity(self._robot, physicsClientId=self._client)
-        return position, orientation, linear, angular
 
     def push(self, push: Push) -> None:
         """Let its force act in the next physics step."""

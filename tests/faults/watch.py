@@ -176,4 +176,5 @@ class Watch:
                 outcome.speed = speed
             return given
 
+        motors.watched = True
         motors.drive = watched  # type: ignore[method-assign]

@@ -1,7 +1,8 @@
 """A training tick against the physics steps and PyBullet calls that it contains: what all else costs.
 
-An episode is played, the engine's calls are written down, then the same calls are made once more with nothing around
-them: the same torques from the same start, so the same physics.
+An episode is played with all its calls through PyBullet's module. They are written down, then made once more with
+nothing around them: the same torques from the same start, so the same physics. What is measured against them does the
+like from compiled code (``sim.bullet.native``) where it can.
 """
 
 from __future__ import annotations
@@ -101,9 +102,12 @@ def _listen(stage: Stage, task: Task) -> list[Call]:
     _play(stage, task)
     world: Any = stage.world
     bullet = world._engine.bullet
+    direct = world._robot.direct
+    world._robot.direct = False
     world._engine.bullet = world._robot.bullet = listening = Listening(bullet)
     _play(stage, task)
     world._engine.bullet = world._robot.bullet = bullet
+    world._robot.direct = direct
     return listening.calls
 
 
