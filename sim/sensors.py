@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from drivers.description import JointLimits
@@ -17,6 +19,8 @@ WARMING_TIME = 200.0
 """Thermal time constant of a motor, s."""
 VOLTAGE = 24.0
 """V."""
+DRAWN = 100
+"""Samples whose noise is drawn at once."""
 
 
 class Sensors:
@@ -34,6 +38,7 @@ class Sensors:
         """Start an episode: cold motors, new biases drawn from ``seed``."""
         self._noisy = noise != Noise()
         self._random = np.random.default_rng(seed)
+        self._draws: Iterator[Array] = iter(())
         self._temperature = np.full((4, 3), AMBIENT)
         draw = self._random.standard_normal
         self._bias = np.concatenate([
@@ -61,7 +66,7 @@ class Sensors:
         read = exact
         if self._noisy:
             read = np.empty(READINGS)
-            disturb(exact, self._bias, self._sigma, self._random.standard_normal(ERRORS), read)
+            disturb(exact, self._bias, self._sigma, self._draw(), read)
         position, velocity, torque = read[:36].reshape(3, 4, 3)
         return Measurement(
             stamp=stamp,
@@ -69,3 +74,11 @@ class Sensors:
             joints=JointState(position, velocity, torque, self._temperature, self._no_fault, self._no_age),
             voltage=VOLTAGE,
         )
+
+    def _draw(self) -> Array:
+        """The next errors, of deviation one; drawn many at a time, which are the same numbers. Shape (45,)."""
+        row = next(self._draws, None)
+        if row is None:
+            self._draws = iter(self._random.standard_normal((DRAWN, ERRORS)))
+            row = next(self._draws)
+        return row

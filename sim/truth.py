@@ -11,8 +11,8 @@ from drivers.robot import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Trunk:
-    """The trunk's exact state, for rewards and tests; never for the controller. World frame."""
+class Truth:
+    """For rewards and tests; never for the controller. World frame."""
 
     position: Array
     """Body origin, m. Shape (3,)."""
@@ -22,12 +22,6 @@ class Trunk:
     """Of the body origin, m/s. Shape (3,)."""
     angular_velocity: Array
     """rad/s. Shape (3,)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Truth(Trunk):
-    """The whole robot's."""
-
     foot_contacts: NDArray[np.bool_]
     """Feet that touched the ground in the last physics step. Shape (4,)."""
     foot_forces: Array

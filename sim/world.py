@@ -25,7 +25,7 @@ from sim.scenario import Push, Scenario
 from sim.sensing import BODY, POSITION, RATE, READINGS, ROTATION, VELOCITY, read_body
 from sim.sensors import Sensors
 from sim.terrain import Plane, Slope, Terrain, resting_height
-from sim.truth import Trunk, Truth
+from sim.truth import Truth
 from sim.urdf import read_model
 
 FAR = 100.0
@@ -82,6 +82,7 @@ class World:
             self._robot.check_inertia(self._model)
             self.reset(Scenario())
             self.step(damp_command(0.0))  # compiles here what would otherwise compile in somebody's first tick
+            self.fallen()
             self.reset(Scenario())
         except BaseException:
             self.close()
@@ -171,10 +172,9 @@ class World:
         return bool(self._body[11] < math.cos(tilt)) or self._robot.body_touches()
 
     @property
-    def trunk(self) -> Trunk:
-        """The trunk's exact state now: a part of ``truth`` that costs nothing."""
-        body = self._body
-        return Trunk(body[POSITION], body[ROTATION].reshape(3, 3), body[VELOCITY], body[RATE])
+    def body(self) -> Array:
+        """The trunk's exact state now, a part of ``truth`` that costs nothing. ``sensing.BODY``, (18,)."""
+        return self._body
 
     @property
     def truth(self) -> Truth:
@@ -183,16 +183,9 @@ class World:
         body = self._body
         position, velocity, torque = self.joints
         return Truth(
-            body[POSITION],
-            body[ROTATION].reshape(3, 3),
-            body[VELOCITY],
-            body[RATE],
-            contacts,
-            forces,
-            position,
-            velocity,
-            torque,
-        )
+            body[POSITION], body[ROTATION].reshape(3, 3), body[VELOCITY], body[RATE],
+            contacts, forces, position, velocity, torque,
+        )  # fmt: skip
 
     @property
     def foot_contacts(self) -> NDArray[np.bool_]:
@@ -200,10 +193,9 @@ class World:
         return self._robot.foot_contacts()
 
     @property
-    def joints(self) -> tuple[Array, Array, Array]:
-        """Exact joint positions rad, velocities rad/s and motor torques N·m now: a part of ``truth``. Each (4, 3)."""
-        position, velocity, torque = self._exact[:36].reshape(3, 4, 3)
-        return position, velocity, torque
+    def joints(self) -> Array:
+        """Exact joint positions rad, velocities rad/s and motor torques N·m, a part of ``truth``. Shape (3, 4, 3)."""
+        return self._exact[:36].reshape(3, 4, 3)
 
     def close(self) -> None:
         """Release the simulator. Harmless when repeated."""

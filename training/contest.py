@@ -158,9 +158,8 @@ class _Tally:
         x, y, z = truth.position.tolist()
         above = z - self._ground.height_at(x, y)
         score_task(
-            self._table, self._world.period, self._smoothed, command, above - self._height, truth.linear_velocity,
-            truth.rotation_body_to_world, truth.angular_velocity, truth.joint_position, truth.joint_velocity,
-            truth.joint_torque, truth.foot_contacts, self._geometry, self._sums,
+            self._table, self._world.period, self._smoothed, command, above - self._height, self._world.body,
+            self._world.joints, truth.foot_contacts, self._geometry, self._sums,
         )  # fmt: skip
         self._squares += truth.joint_torque**2
         self._peak = max(self._peak, float(np.abs(truth.joint_torque).max()))

@@ -112,13 +112,11 @@ class WalkEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         set_parameters(self._controller.policy_record, self._controller.policy, matrix.ravel())
 
     def _score(self) -> tuple[Array, bool]:
-        truth = self._world.truth
-        x, y, z = truth.position.tolist()
+        x, y, z = self._world.body[:3].tolist()
         above = z - self._ground.height_at(x, y)
         terms = np.zeros(len(TASK_TERMS))
         score_task(
-            self._table, self._world.period, self._smoothed, self._asked, above - self._height, truth.linear_velocity,
-            truth.rotation_body_to_world, truth.angular_velocity, truth.joint_position, truth.joint_velocity,
-            truth.joint_torque, truth.foot_contacts, self._controller.geometry, terms,
+            self._table, self._world.period, self._smoothed, self._asked, above - self._height, self._world.body,
+            self._world.joints, self._world.foot_contacts, self._controller.geometry, terms,
         )  # fmt: skip
         return terms, above > LOWEST * self._height

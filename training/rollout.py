@@ -92,16 +92,15 @@ def walk(world: World, walker: Walker, conditions: Conditions, commands: Array, 
     measurement = world.reset(conditions.scenario)
     walker.reset(measurement)
     command = standing_command(measurement, world)
+    status, failed = walker.record["solver_status"], int(SolverStatus.FAILED)
+    changes = [True, *(commands[1:] != commands[:-1]).any(axis=1).tolist()]
     asked = VelocityCommand()
-    before = np.full(3, np.nan)
-    for tick, wanted in enumerate(commands):
+    for tick, (wanted, changed) in enumerate(zip(commands, changes, strict=True)):
         measurement = world.step(command)
-        if not np.array_equal(wanted, before):
+        if changed:
             asked = VelocityCommand(linear=wanted[:2], yaw_rate=float(wanted[2]))
-            before = wanted
         command = walker.step(measurement, asked)
-        failed = walker.record["solver_status"][0] == SolverStatus.FAILED
-        if failed or (tick % FALL_CHECK == 0 and world.fallen()):
+        if status[0] == failed or (tick % FALL_CHECK == 0 and world.fallen()):
             return tick, True
         if not watch(tick, wanted):
             return tick + 1, True
@@ -158,13 +157,12 @@ class Stage:
         world, record, lowest = self.world, self._walker.record, self._lowest
         ground, start_yaw = task.conditions.scenario.terrain, task.conditions.scenario.rpy[2]
 
+        forces, weight = record["grf"][0], self._weight
+
         def watch(tick: int, _: Array) -> bool:
-            trunk = world.trunk
-            score_table(
-                table, features[tick], start_yaw, trunk.position, trunk.linear_velocity, trunk.rotation_body_to_world,
-                trunk.angular_velocity, record["grf"][0], self._weight, sums,
-            )  # fmt: skip
-            x, y, z = trunk.position.tolist()
+            body = world.body
+            score_table(table, features[tick], start_yaw, body, forces, weight, sums)
+            x, y, z = body[:3].tolist()
             return bool(z - ground.height_at(x, y) > lowest)
 
         return self._play(task, watch, TABLE_TERMS, sums)
@@ -176,13 +174,12 @@ class Stage:
         ground = task.conditions.scenario.terrain
 
         def watch(_: int, command: Array) -> bool:
-            trunk, joints = world.trunk, world.joints
-            x, y, z = trunk.position.tolist()
+            body = world.body
+            x, y, z = body[:3].tolist()
             above = z - ground.height_at(x, y)
             score_task(
-                table, dt, smoothed, command, above - height, trunk.linear_velocity, trunk.rotation_body_to_world,
-                trunk.angular_velocity, *joints, world.foot_contacts, geometry, sums,
-            )  # fmt: skip
+                table, dt, smoothed, command, above - height, body, world.joints, world.foot_contacts, geometry, sums
+            )
             return bool(above > self._lowest)
 
         return self._play(task, watch, TASK_TERMS, sums)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.robot import JOINTS, LEGS, Array
 from sim.bullet.engine import Engine
-from sim.bullet.native import RUN_DTYPE, look, run
+from sim.bullet.native import RUN_DTYPE, look, run, touch
 from sim.errors import PhysicsError
 from sim.model import PAYLOAD, Model
 from sim.rotation import from_xyzw, to_quaternion
@@ -56,6 +56,8 @@ class Multibody:
         record["friction"], record["sticking_speed"] = friction, STICKING_SPEED
         record["position_index"] = [infos[joint][3] for joint in self._joints]
         record["velocity_index"] = [infos[joint][4] for joint in self._joints]
+        record["feet"] = list(self._foot_of_link)
+        self._touching: NDArray[np.bool_] = record["touching"].view(np.bool_)
         self.raw: Array = record["raw"]
         """The state that was looked at last, as ``sensing.RAW`` says; the torques are ``run``'s or the caller's."""
 
@@ -157,10 +159,16 @@ class Multibody:
 
     def body_touches(self) -> bool:
         """Whether the body, not a leg, touched something in the last physics step."""
+        if self.direct:
+            touch(self._memory)
+            return bool(self._touching[4])
         return bool(self.bullet.getContactPoints(self._robot, linkIndexA=-1, physicsClientId=self._client))
 
     def foot_contacts(self) -> NDArray[np.bool_]:
         """Feet that touched the ground in the last physics step. Shape (4,)."""
+        if self.direct:
+            touch(self._memory)
+            return self._touching[:4].copy()
         touched = [False] * 4
         for leg, _ in self._foot_points():
             touched[leg] = True

@@ -22,6 +22,10 @@ from numba import types
 
 TORQUE_CONTROL = 1
 """``b3ControlMode`` of that name."""
+CONTACT_WORDS = 22
+"""Size of ``b3ContactPointData``: five integers of 4 bytes (flags, two bodies, two links), then floats."""
+FORCE = 13
+"""Which word of it is the force along the normal, N."""
 RUN_DTYPE = np.dtype(
     [
         ("client", "i8"),
@@ -31,7 +35,10 @@ RUN_DTYPE = np.dtype(
         ("friction", "f8"),  # N·m, dry
         ("sticking_speed", "f8"),  # below it the friction fades, rad/s
         ("raw", "f8", (49,)),  # as ``sensing.RAW`` says
+        ("feet", "i4", (4,)),  # links
+        ("touching", "u1", (5,)),  # feet, body
         ("answer", "i8", (7,)),
+        ("contact", "f8", (CONTACT_WORDS,)),
     ],
     align=True,
 )
@@ -55,6 +62,9 @@ _begin_step = _outside("b3InitStepSimulationCommand", _PLACE, _PLACE)
 _begin_state = _outside("b3RequestActualStateCommandInit", _PLACE, _PLACE, _INT)
 _submit = _outside("b3SubmitClientCommandAndWaitStatus", _PLACE, _PLACE, _PLACE)
 _state_of = _outside("b3GetStatusActualState", _INT, *[_PLACE] * 8)
+_begin_contacts = _outside("b3InitRequestContactPointInformation", _PLACE, _PLACE)
+_filter_body = _outside("b3SetContactFilterBodyA", types.void, _PLACE, _INT)
+_contacts_of = _outside("b3GetContactPointInformation", types.void, _PLACE, _PLACE)
 _copy = _outside("memcpy", _PLACE, _PLACE, _PLACE, _PLACE)
 
 
@@ -114,6 +124,25 @@ def run(memory, law, peak, torques):  # type: ignore[no-untyped-def]
 def look(memory):  # type: ignore[no-untyped-def]
     """Fill ``raw`` of the ``RUN_DTYPE`` in ``memory``, all but the torques. Returns whether the engine answered."""
     return _look(memory.view(RUN_DTYPE)[0])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def touch(memory):  # type: ignore[no-untyped-def]
+    """Fill ``touching`` of the ``RUN_DTYPE`` in ``memory``: feet that are pressed upon, then if the body touches."""
+    m = memory.view(RUN_DTYPE)[0]
+    m.touching[:] = 0
+    request = _begin_contacts(m.client)
+    _filter_body(request, m.body)
+    _submit(m.client, request)
+    _contacts_of(m.client, m.answer.ctypes.data)  # how many, of 4 bytes, and where they lie
+    for index in range(m.answer.view(np.int32)[0]):
+        _copy(m.contact.ctypes.data, m.answer[1] + 8 * CONTACT_WORDS * index, 8 * CONTACT_WORDS)
+        link = m.contact.view(np.int32)[3]
+        if link == -1:
+            m.touching[4] = 1
+        for leg in range(4):
+            if link == m.feet[leg] and m.contact[FORCE] > 0.0:
+                m.touching[leg] = 1
 
 
 @lru_cache
