@@ -2,7 +2,7 @@
 
 A back-end carries frames ``(bus, arbitration id, data)``, buses counted from 0. Each tick is one ``cycle``: all frames
 out, then replies handed to ``receive`` as they come, until it says that it has all or the time is up. The wires are in
-``drivers.can_bus`` (python-can) and ``drivers.pi3hat``.
+``drivers.can_bus`` (python-can's, each in ``drivers.can_channels``) and ``drivers.pi3hat``.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.bus import BusCounters, Frame
-from drivers.can_bus import Channel, open_channel
+from drivers.can_channels import Channel, open_channel
 from drivers.wiring import BusConfig
 from sim.servo import ServoEmulator
 

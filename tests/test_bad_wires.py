@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_hardware import STAND, Body
 
-from drivers import can_bus, xbus_link
+from drivers import can_channels, xbus_link
 from drivers.bus import BusCounters
 from drivers.errors import DriverError
 from drivers.moteus_registers import Mode
@@ -96,7 +96,7 @@ def test_a_bus_that_cannot_be_opened_says_which_and_why(monkeypatch: pytest.Monk
     monkeypatch.setattr(can, "Bus", refuse)
     config = BusConfig(backend="socketcan", channels=("can0", "can1"))
     with pytest.raises(DriverError) as caught:
-        can_bus.open_channel(config, 1, BusCounters(), fd=True)
+        can_channels.open_channel(config, 1, BusCounters(), fd=True)
     assert f"bus 2 (socketcan can1): {error}; {advice}" in str(caught.value)
 
 

@@ -6,15 +6,18 @@ import asyncio
 import errno
 import socket
 import threading
+import time
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
 import can
+import msgpack
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
 from drivers.bus import BusCounters
-from drivers.can_bus import PythonCanBus, SocketCanChannel, open_channel
+from drivers.can_bus import PythonCanBus
+from drivers.can_channels import SocketCanChannel, open_channel
 from drivers.errors import DriverError
 from drivers.pi3hat import Pi3HatBus, load_library
 from drivers.wiring import BusConfig
@@ -246,6 +249,32 @@ def test_real_transports_carry_a_cycle_and_its_echoes(backend):
             bus.shutdown()
     wanted = {(0, 11, b"1"), (0, 12, b"2"), (1, 21, b"3"), (1, 22, b"4")}
     assert got == {(bus, motor << 8, letter * 48) for bus, motor, letter in wanted}
+
+
+GARBAGE = (
+    b"", b"\xc1", b"\x81", b"\xa1\xff", msgpack.packb(7), msgpack.packb([1, 2]), msgpack.packb({"data": b"x"}),
+    msgpack.packb({"arbitration_id": "1", "data": b"x", "is_error_frame": False}),
+    msgpack.packb({"arbitration_id": 1, "data": None, "is_error_frame": False}),
+    msgpack.packb({"arbitration_id": 1, "data": b"x", "is_error_frame": True}),
+)  # fmt: skip
+
+
+def test_datagrams_that_are_no_frames_are_counted_and_passed_over():
+    group, port, counters = "239.74.163.63", 47119, BusCounters()
+    try:
+        channel = open_channel(config("udp_multicast", group, port=port), 0, counters, True)
+    except DriverError as error:
+        pytest.skip(f"no multicast here: {error}")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for raw in GARBAGE:
+            stranger.sendto(raw, (group, port))
+    channel.send(0x800B, b"1" * 48)
+    frames, end = [], time.monotonic() + 5.0
+    while not frames and time.monotonic() < end:
+        frames += channel.read()
+    channel.close()
+    assert frames == [(0x800B, b"1" * 48)]
+    assert counters.error_frames == len(GARBAGE)
 
 
 class StandIn:
