@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.errors import CorruptFrame
@@ -207,29 +207,12 @@ class MoteusEmulator:
         self._planned += math.copysign(min(abs(way), fastest * elapsed), way)
         return self._planned
 
-    def _read(self, register: int) -> float | None:
-        return {
-            int(Register.MODE): float(self.mode),
-            int(Register.POSITION): self.position,
-            int(Register.VELOCITY): self.velocity,
-            int(Register.TORQUE): self.torque,
-            int(Register.Q_CURRENT): self.torque / 0.6,
-            int(Register.D_CURRENT): 0.0,
-            int(Register.MOTOR_TEMPERATURE): math.nan,
-            int(Register.VOLTAGE): self.voltage,
-            int(Register.TEMPERATURE): self.temperature,
-            int(Register.FAULT): float(self.fault),
-            int(Register.MODEL_NUMBER): 1.0,
-            int(Register.FIRMWARE_VERSION): float(self.firmware),
-            int(Register.REGISTER_MAP_VERSION): 5.0,
-            int(Register.SERIAL_NUMBER): float(0x1000 + self.id),
-        }.get(register)
-
     def _reply(self, asked: Sequence[tuple[int, int]]) -> bytes:
         reply, run = b"", b""
         first, count, previous = 0, 0, (-2, -1)
         for register, resolution in asked:
-            value = self._read(register)
+            read = _READABLE.get(register)
+            value = None if read is None else read(self)
             if count and (value is None or (register, resolution) != (previous[0] + 1, previous[1])):
                 reply, run, count = reply + _run(first, count, previous[1], run), b"", 0
             if value is None:
@@ -258,3 +241,24 @@ def _pack(register: int, resolution: int, value: float) -> bytes:
     scales = SCALES.get(register)
     steps = round(value / scales[resolution]) if scales else int(value)
     return struct.pack(_CODES[resolution], max(-_MAX[resolution], min(_MAX[resolution], steps)))
+
+
+_READABLE: dict[int, Callable[[MoteusEmulator], float]] = {
+    int(register): read
+    for register, read in {
+        Register.MODE: lambda servo: float(servo.mode),
+        Register.POSITION: lambda servo: servo.position,
+        Register.VELOCITY: lambda servo: servo.velocity,
+        Register.TORQUE: lambda servo: servo.torque,
+        Register.Q_CURRENT: lambda servo: servo.torque / 0.6,
+        Register.D_CURRENT: lambda _: 0.0,
+        Register.MOTOR_TEMPERATURE: lambda _: math.nan,
+        Register.VOLTAGE: lambda servo: servo.voltage,
+        Register.TEMPERATURE: lambda servo: servo.temperature,
+        Register.FAULT: lambda servo: float(servo.fault),
+        Register.MODEL_NUMBER: lambda _: 1.0,
+        Register.FIRMWARE_VERSION: lambda servo: float(servo.firmware),
+        Register.REGISTER_MAP_VERSION: lambda _: 5.0,
+        Register.SERIAL_NUMBER: lambda servo: float(0x1000 + servo.id),
+    }.items()
+}
