@@ -43,7 +43,7 @@ def one_line(result: subprocess.CompletedProcess[str]) -> str:
         ("rate_hz = 200.0", "rate_hz = 2.0", "control.rate_hz = 2.0: Expected `float` >= 50"),
         ("swing_time", "swing_tim", "swing_tim"),
         ("[control.gait]", "[control.gait", "not TOML"),
-        ('policy = "balance.json"', 'policy = "nothing.json"', "policy 'nothing.json': no such file"),
+        ('policy = "trot.json"', 'policy = "nothing.json"', "policy 'nothing.json': no such file"),
         ('name = "stoch3"', 'name = "other"', "this robot is 'other'"),
         ('solver = "daqp"', 'solver = "magic"', "magic"),
     ],
