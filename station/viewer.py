@@ -14,6 +14,7 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 import rerun as rr
 
@@ -43,8 +44,14 @@ class Screen:
     memory: str = "1GiB"
     """The viewer's bound; its oldest data go first."""
 
+    @property
+    def address(self) -> str:
+        """What a browser on this machine opens: the page, and where it finds the data."""
+        data = quote(f"rerun+http://127.0.0.1:{self.grpc_port}/proxy", safe="")
+        return f"http://127.0.0.1:{self.web_port}/?url={data}"
+
     def open(self, name: str) -> rr.RecordingStream:
-        """A stream that ends on this screen, laid out for a robot.
+        """A stream that ends on this screen, laid out for a robot. A browser is served for as long as it is kept.
 
         Raises:
             StationError: the file cannot be written, or there is no viewer to start.

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
+import socket
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
+from daemons import until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -16,7 +24,7 @@ from runtime.recording import RecordingError, load
 from station import ticks as station_ticks
 from station.canvas import SCENE_HZ, Canvas
 from station.pose import heading_to_world, leg_points, orientation_xyzw
-from station.session import StationError
+from station.session import StationError, free_endpoint
 from station.viewer import Screen, view_recording
 
 rr = pytest.importorskip("rerun")
@@ -67,6 +75,27 @@ def test_a_recording_becomes_an_rrd_with_every_tick_in_the_charts(walked: Walk, 
     written = (tmp_path / "seen.rrd").read_bytes()
     assert written[:4] == b"RRF2"
     assert len(written) > 100 * len(load(path).ticks)
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as asking:
+        return asking.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_a_browser_finds_page_and_data_of_a_recording_for_as_long_as_it_looks(walked: Walk) -> None:
+    web, data = (int(free_endpoint().rsplit(":", 1)[1]) for _ in range(2))
+    words = ["view", str(walked.write("browsed")), "--web", "--web-port", str(web), "--port", str(data)]
+    with subprocess.Popen([sys.executable, "-m", "trotd.cli", *words], stderr=subprocess.PIPE, text=True) as viewing:
+        try:
+            assert viewing.stderr is not None
+            line = viewing.stderr.readline()
+            assert f"http://127.0.0.1:{web}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data}%2Fproxy" in line
+            asyncio.run(until(lambda: listens(web) and listens(data)))
+            time.sleep(3.0)  # drawn by now; who lets go of the stream then closes the door
+            assert listens(web) and listens(data)
+        finally:
+            viewing.send_signal(signal.SIGINT)
+        assert viewing.wait(30.0) == 130
 
 
 def test_charts_take_every_tick_and_the_scene_its_own_rate(walked: Walk) -> None:

@@ -71,12 +71,13 @@ def view(
     screen = viewer.Screen(save=save, web=web, web_port=web_port, grpc_port=port, memory=memory)
     end = time.monotonic() + seconds if seconds > 0 else float("inf")
     if web:
-        typer.echo(f"viewer: http://127.0.0.1:{web_port}  (Ctrl-C ends it)", err=True)
+        typer.echo(f"viewer: {screen.address}  (Ctrl-C ends it)", err=True)
     with refusals():
         if recording is not None:
-            viewer.view_recording(recording, screen)
+            drawn = viewer.view_recording(recording, screen)
             while web and time.monotonic() < end:
                 time.sleep(0.1)
+            drawn.disconnect()
         else:
             known = config.load(config.find_robot(robot))
             with connected(known.robot.name, connect) as station:
