@@ -22,7 +22,7 @@ from runtime.control.policy import (
     set_parameters,
 )
 from runtime.control.records import Clamp
-from runtime.policies import decode, verify
+from runtime.policies import decode, find_policy, load, verify
 
 RNG = np.random.default_rng(0)
 MATRIX = RNG.normal(size=(18, 28))
@@ -178,9 +178,16 @@ def test_hand_built_policy_pushes_against_every_error(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_shipped_policies_are_the_hand_built_ones(name: str) -> None:
+def test_a_hand_built_policy_is_shipped_for_every_robot(name: str) -> None:
     known = robot(name)
-    assert policy(name) == balance_policy(known.robot, known.control.gait.walking_height)
+    built = balance_policy(known.robot, known.control.gait.walking_height)
+    assert load(find_policy(built.name), known.robot.name) == built
+
+
+def test_stoch3_walks_by_a_policy_that_says_how_it_was_trained() -> None:
+    provenance = policy("stoch3").provenance
+    assert provenance["made"] == "trotd train"
+    assert {"run", "iteration", "versions", "validation"} <= set(provenance)
 
 
 def test_file_form_reads_back_the_same_and_has_one_line_a_row() -> None:
