@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.robot import Array, JointCommand, Measurement
+from drivers.robot import LEGS, Array, JointCommand, Measurement
 from runtime import keyframe, modes
 from runtime.arming import Arming
 from runtime.config import Config
@@ -35,7 +35,7 @@ _DAMP, _STAND_UP, _STAND, _WALK, _SIT_DOWN = Mode  # an enum's attribute costs a
 _OK, _SOLVER_FAILED, _OPERATOR_LOST = Reason.OK, Reason.SOLVER_FAILED, Reason.OPERATOR_LOST
 _UPRIGHT = (_STAND, _WALK)
 _FAILED = int(SolverStatus.FAILED)
-_DEADMAN = int(Clamp.DEADMAN)
+_DEADMAN, _CONTACT = int(Clamp.DEADMAN), int(Clamp.CONTACT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +79,8 @@ class Cycle:
         """How often each clamp acted."""
         self.solver = [0] * len(SolverStatus)
         """How often each solver status came, in ticks that stepped the controller."""
+        self.doubted: tuple[str, ...] = ()
+        """Legs whose feet are not believed."""
         self.checks: tuple[ArmingCheck, ...] = ()
         """The arming list of the last request to arm."""
         self.outside: Callable[[], Sequence[ArmingCheck]] = tuple
@@ -169,6 +171,8 @@ class Cycle:
         share = 0.0 if modes.stopping(self.state) else self.guard.speed_share
         command = sources.step(self.state.mode, wake.stamp, measurement, self.guard.imu_believed, share)
         command = self._bounded(command, measurement)
+        if self._row["clamps"] & _CONTACT or self.doubted:
+            self._look_at_contacts(measurement)
         self._note_command(command)
         return command
 
@@ -289,6 +293,20 @@ class Cycle:
         command = sources.limp()
         self._record.write_command(command)
         return command
+
+    def _look_at_contacts(self, measurement: Measurement) -> None:
+        """Tell which feet are no longer believed, or again; more than one of them ends the walk."""
+        doubted = tuple(name for name, left in zip(LEGS, self.controller.state["doubt"][0], strict=True) if left > 0.0)
+        if doubted == self.doubted:
+            return
+        for name in (*doubted, *self.doubted):
+            if name not in self.doubted:
+                self.note("contact", f"{name}: what the foot feels contradicts its leg; the gait's schedule instead")
+            elif name not in doubted:
+                self.note("contact", f"{name}: what the foot feels is believed again")
+        self.doubted = doubted
+        if len(doubted) > 1 and self.state.mode in _UPRIGHT:
+            self._fail(Reason.LYING_CONTACTS, measurement, f"{' '.join(doubted)}: {Reason.LYING_CONTACTS.words}")
 
     def _note_command(self, command: JointCommand) -> None:
         row, state, sources = self._row, self.state, self.sources

@@ -13,6 +13,7 @@ from runtime.modes import SEATED, WHOLE, WORDS, Reason
 LIMITS, PLAUSIBILITY, CYCLE = "tests/test_limits.py", "tests/test_plausibility.py", "tests/test_cycle.py"
 ENCODERS, DEGRADE = "tests/test_encoders.py", "tests/test_degrade.py"
 TORTURE, DAEMON = "tests/test_torture.py", "tests/test_daemon.py"
+CONTACTS = "tests/test_lying_contacts.py"
 INJECTED = f"{LIMITS}::test_an_injected_fault_is_named"
 WEAK_MOTOR = f"{PLAUSIBILITY}::test_a_motor_that_does_not_give_what_it_is_told_is_found"
 
@@ -138,6 +139,21 @@ TABLE: tuple[Fault, ...] = (
         f"{ENCODERS}::test_an_encoder_that_stands_still_while_the_robot_tilts_is_found",
         "nothing until it shows: its motor holds with the torque that it held with before; then damps",
     ),
+    Fault(
+        "one foot feels the ground always, or never",
+        None,
+        "contact.feel_contacts",
+        "`lie_strides` strides",
+        f"{CONTACTS}::test_a_foot_that_lies_is_found_and_the_robot_walks_on",
+        "the gait's schedule says whether it is down (`CONTACT`), an event names the leg",
+    ),
+    Fault(
+        "more than one foot does",
+        Reason.LYING_CONTACTS,
+        "cycle",
+        "1",
+        f"{CONTACTS}::test_two_feet_that_lie_end_the_walk",
+    ),
     Fault("a motor gives no torque", Reason.TORQUE_LOST, "plausibility.look_at_motor", "0.14 s", WEAK_MOTOR),
     Fault("a motor turns the wrong way", Reason.REVERSED_MOTOR, "plausibility.look_at_motor", "0.05 s", WEAK_MOTOR),
     Fault(
@@ -205,6 +221,14 @@ TABLE: tuple[Fault, ...] = (
         "limits.judge_policy",
         "1",
         f"{PLAUSIBILITY}::test_a_policy_that_asks_for_what_cannot_be_is_found",
+    ),
+    Fault(
+        "one QP solver fails, or both",
+        None,
+        "solvers.Ladder",
+        "1",
+        "tests/test_controller.py::test_every_step_of_the_ladder_is_named_in_the_record",
+        "the second solver's forces; without them clipped least squares (`FALLBACK`), and it walks on",
     ),
     Fault(
         "no ground reaction forces",

@@ -66,6 +66,7 @@ class Reason(IntEnum):
     BAD_POLICY = 63
     ASTRAY = 64
     STUCK_ENCODER = 65
+    LYING_CONTACTS = 66
 
     @property
     def words(self) -> str:
@@ -126,6 +127,7 @@ WORDS: dict[Reason, str] = {
     Reason.BAD_POLICY: "the policy asks for what cannot be",
     Reason.ASTRAY: "a joint does not follow its target",
     Reason.STUCK_ENCODER: "an encoder does not move any more",
+    Reason.LYING_CONTACTS: "more than one foot feels what cannot be",
 }
 
 
@@ -145,7 +147,7 @@ class Reaction(IntEnum):
 
 HALTS = frozenset({Reason.OPERATOR_LOST, Reason.LATE_LOOP, Reason.SLOWING})
 """Why a walking robot stops without a fault."""
-WHOLE = frozenset({Reason.HOT_MOTOR, Reason.OVERLOAD, Reason.LOW_VOLTAGE})
+WHOLE = frozenset({Reason.HOT_MOTOR, Reason.OVERLOAD, Reason.LOW_VOLTAGE, Reason.LYING_CONTACTS})
 """Faults that leave every leg answering and the controller whole."""
 SEATED = frozenset(
     {

@@ -43,6 +43,7 @@ CLAMP_WORDS = {
     Clamp.COASTED: "a motor's reading older than a tick",
     Clamp.EXTRAPOLATED: "IMU sample carried on by its rate",
     Clamp.STOPPING: "stopping: at rest instead of the velocity asked",
+    Clamp.CONTACT: "a foot's feel contradicts its leg: the gait's schedule",
 }
 """Every bit of ``clamps`` as people would say it."""
 

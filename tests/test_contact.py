@@ -56,10 +56,10 @@ def test_no_contact_begins_early_in_a_swing_but_one_can_end() -> None:
     bench = Workbench(contact={"blanking": 0.5, "force_time_constant": 0.0})
     bench.s.swinging[0] = 1
     for phase, expected in ((0.1, False), (0.49, False), (0.51, True)):
-        bench.s.contacts[0] = 0
+        bench.s.felt[0] = 0
         bench.s.phase[0] = phase * np.pi
         assert feel(bench, 200.0) is expected
-    bench.s.contacts[0], bench.s.phase[0] = 1, 0.1
+    bench.s.felt[0], bench.s.phase[0] = 1, 0.1
     assert feel(bench, 200.0)
     assert not feel(bench, 0.0)
 
@@ -103,5 +103,5 @@ def test_when_no_foot_agrees_with_the_estimate_the_feet_are_believed() -> None:
 
 def test_not_a_number_is_no_contact() -> None:
     bench = Workbench()
-    bench.s.contacts[0] = 1
+    bench.s.felt[0] = 1
     assert not feel(bench, np.nan)

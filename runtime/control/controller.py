@@ -15,7 +15,7 @@ from runtime.control.kinematics import GEOMETRY_DTYPE, leg_geometry
 from runtime.control.observation import observe
 from runtime.control.parameters import ControlConfig
 from runtime.control.policy import Policy, act, mix_terms, policy_record
-from runtime.control.records import CONTROL_DTYPE, Records, SolverStatus, VelocityCommand
+from runtime.control.records import CONTROL_DTYPE, Clamp, Records, SolverStatus, VelocityCommand
 from runtime.control.solvers import Ladder, make_solver
 from runtime.control.state import (
     PARAMETERS_DTYPE,
@@ -28,6 +28,7 @@ from runtime.control.state import (
 from runtime.control.torque import command_joints, damp_joints
 from runtime.control.trajectory import aim_feet
 
+_CONTACT = int(Clamp.CONTACT)
 IDLE, SOLVED, FAILED = int(SolverStatus.IDLE), int(SolverStatus.SOLVED), int(SolverStatus.FAILED)
 
 CORE_DTYPE = np.dtype(
@@ -76,7 +77,7 @@ def plan(memory, record, linear, yaw_rate, standing):  # type: ignore[no-untyped
         record.view(CONTROL_DTYPE)[0],
     )
     p, g, policy, m = c.parameters, c.geometry, c.policy, c.work
-    t.clamps = 0
+    t.clamps = _CONTACT if s.doubt.max() > 0.0 else 0
     if not np.isfinite(linear[0] + linear[1] + yaw_rate):
         return -1
     follow(p, policy, s, t, linear, yaw_rate, standing)

@@ -63,6 +63,14 @@ class ContactConfig(Record, frozen=True, kw_only=True):
     """A foot that moves faster over the ground, while another one rests, is in the air, m/s."""
     baseline: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Vertical force that each leg's torque feigns, N; the calibration has the last word."""
+    lie_rise: Positive = 0.03
+    """A foot that has risen so far from where it stood, m, and still bears, lies ..."""
+    lie_time: tuple[Positive, Positive] = (0.05, 0.015)
+    """... and so does one that presses down and feels nothing: told by so much at least of a stance, a swing, s."""
+    lie_strides: Annotated[int, Meta(ge=1, le=20)] = 3
+    """A foot is doubted that lied in so many stances, or swings, one after the other."""
+    doubt_time: NonNegative = 2.0
+    """From the last of them on the schedule says for so long whether the foot is down, s; 0: what it feels does."""
 
 
 class GrfConfig(Record, frozen=True, kw_only=True):

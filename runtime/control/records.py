@@ -91,6 +91,8 @@ class Clamp(IntFlag):
     """No new believable sample of the IMU: the last one carried on by its own rate of turn."""
     STOPPING = 524288
     """The robot is on its way to standing: at rest instead of what was asked."""
+    CONTACT = 1048576
+    """What a foot feels contradicts what its leg does: the gait's schedule says instead whether it is down."""
 
 
 ESTIMATE_FIELDS: Fields = [

@@ -48,6 +48,13 @@ STATE_DTYPE = np.dtype(
         ("contacts", "u1", (4,)),
         ("pressure", "f8", (4,)),  # low-passed vertical force, N
         ("lifted", "u1", (4,)),  # the foot moves over the ground
+        ("felt", "u1", (4,)),  # contact by force alone
+        ("ground", "f8", (4,)),  # height of the foot above the lowest one when it last was down, m
+        ("swung", "u1", (4,)),  # swinging, a tick ago
+        ("tested", "f8", (4,)),  # s of this swing or stance in which a lie would show
+        ("honest", "f8", (4,)),  # s of them in which there was none
+        ("lies", "i8", (4, 2)),  # stances, swings, one after the other, in which the foot lied
+        ("doubt", "f8", (4,)),  # s for which what the foot feels will not be believed
         # estimator
         ("started", "u1"),
         ("velocity", "f8", (3,)),  # of the body origin in the world, m/s
@@ -125,6 +132,10 @@ PARAMETERS_DTYPE = np.dtype(
         ("force_time_constant", "f8"),
         ("lift_speed", "f8"),
         ("contact_baseline", "f8", (4,)),
+        ("lie_rise", "f8"),
+        ("lie_time", "f8", (2,)),  # of stance, swing
+        ("lie_strides", "i8"),
+        ("doubt_time", "f8"),
         # estimator
         ("acceleration_noise", "f8"),
         ("foot_position_noise", "f8"),
@@ -202,6 +213,8 @@ def build_parameters(description: RobotDescription, config: ControlConfig) -> Re
     p["contact_blanking"] = contact.blanking * np.pi
     p["force_time_constant"], p["lift_speed"] = contact.force_time_constant, contact.lift_speed
     p["contact_baseline"] = contact.baseline
+    p["lie_rise"], p["lie_time"], p["lie_strides"] = contact.lie_rise, contact.lie_time, contact.lie_strides
+    p["doubt_time"] = contact.doubt_time
     for name in config.estimator.__struct_fields__:
         p[name] = getattr(config.estimator, name)
     for name in ("friction", "min_force", "max_force", "wrench_weight", "force_weight"):

@@ -41,6 +41,7 @@ from faults.motors import (
     JammedJoint,
     JumpingEncoder,
     LateReplies,
+    LyingFoot,
     MotorFault,
     NoisyEncoder,
     ReversedSign,
@@ -178,6 +179,18 @@ ROWS: tuple[Row, ...] = (
     ),
     Row("encoder_jumping", lambda d: JumpingEncoder(joint(d), within(d, -1.0, 1.0), within(d, 0.01, 1.0), seed(d))),
     Row("encoder_noisy", lambda d: NoisyEncoder(joint(d), within(d, 0.001, 0.1), within(d, 0.1, 10.0), seed(d))),
+    Row(
+        "foot_stuck_on",
+        lambda d: LyingFoot(int(d.integers(4)), round(float(10.0 ** d.uniform(1.6, 3)), 1)),
+        must="stay",
+        seconds=2.0,
+    ),
+    Row(
+        "foot_stuck_off",
+        lambda d: LyingFoot(int(d.integers(4)), -round(float(10.0 ** d.uniform(2, 3)), 1)),
+        must="stay",
+        seconds=2.0,
+    ),
     Row("sign_reversed", lambda d: ReversedSign(joint(d)), lambda d: ReversedSign(joint(d))),
     Row("torque_lost", lambda d: WeakMotors((joint(d),), 0.0), seconds=2.0),
     Row("torque_saturated", lambda d: WeakMotors((joint(d),), within(d, 0.05, 0.6)), seconds=2.0),
@@ -285,6 +298,7 @@ ROWS: tuple[Row, ...] = (
         lambda d: SolverFault(
             str(d.choice(["none", "nan", "raise", "garbage"])), str(d.choice(["none", "nan", "raise"])), seed(d)
         ),
+        must="stay",
     ),
     Row("qp_slow", lambda d: SlowSolver(int(d.integers(1, 6)), within(d, 0.05, 0.5))),
     Row("stall_5ms", lambda d: Stall(0.005), lambda d: Stall(0.005), "stay"),

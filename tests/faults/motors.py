@@ -265,3 +265,14 @@ class BrownOut(Fault):
         self._left -= 1
         volts = self.volts if self._left >= 0 else measurement.voltage
         return replace(changed(measurement, fault=fault), voltage=volts)
+
+
+@dataclass
+class LyingFoot(Fault):
+    """A foot feels so much more force than there is, N: always on the ground, or never."""
+
+    leg: int
+    force: float
+
+    def start(self, rig: Rig) -> None:
+        rig.cycle.controller.parameters["contact_baseline"][0][self.leg] -= self.force
