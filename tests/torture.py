@@ -10,8 +10,10 @@ from typing import Annotated
 
 import typer
 from faults.matrix import BY_NAME, ROWS
+from faults.process import find, suffer
 from faults.report import print_json, print_outcome, print_table, shown, told, worst
 from faults.run import BASES, BODIES, GAITS, Case, replay, run_trunk, trunks
+from faults.watch import Outcome
 from faults.workers import spread
 
 FAILED, BAD_INPUT = 1, 2
@@ -51,12 +53,19 @@ def main(
     gait: Annotated[str | None, typer.Option(help="stand or walk, with --seed; both if not given.")] = None,
     jobs: Annotated[int, typer.Option(help="Worker processes.")] = os.cpu_count() or 1,
     json: Annotated[bool, typer.Option("--json", help="Every fault as JSON.")] = False,
+    process: Annotated[
+        int | None,
+        typer.Option(help="Instead of the matrix: faults of the daemon's process (kill, stop, hog, disk), so often."),
+    ] = None,
     keep: Annotated[Path | None, typer.Option(help="Write the worst of every row to this file, as JSON.")] = None,
 ) -> None:
     """Break a simulated robot in every way of the fault matrix, standing and walking; hold what happens to its bounds.
 
     Exit code 1 if any was violated; each violation is printed with the command that shows it again.
     """
+    if process is not None:
+        _torture_the_process(row, process, json)
+        return
     for name in row or ():
         if name not in BY_NAME:
             typer.echo(f"row {name!r}: not in the matrix; there are {', '.join(BY_NAME)}", err=True)
@@ -85,6 +94,22 @@ def main(
         (print_json if json else print_table)(outcomes)
     if keep is not None:
         keep.write_bytes(worst(outcomes))
+    if any(outcome.violations for outcome in outcomes):
+        raise typer.Exit(FAILED)
+
+
+def _torture_the_process(rows: list[str] | None, times: int, json: bool) -> None:
+    """One after the other, since each is about what the machine does meanwhile; ``rows`` are parts of their names."""
+    names = find(rows)
+    if not names:
+        typer.echo(f"row {', '.join(rows or ())}: in no name of tests/test_process_faults.py", err=True)
+        raise typer.Exit(BAD_INPUT)
+    outcomes: list[Outcome] = []
+    try:
+        outcomes.extend(told(shown(suffer(names, times), "faults of the process", times * len(names))))
+    except KeyboardInterrupt:
+        typer.echo(f"broken off after {len(outcomes)} of {times * len(names)} faults", err=True)
+    (print_json if json else print_table)(outcomes)
     if any(outcome.violations for outcome in outcomes):
         raise typer.Exit(FAILED)
 

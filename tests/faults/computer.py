@@ -142,9 +142,11 @@ class BadSolver:
 
     def __init__(self, kind: str, good: Any, seed: int) -> None:
         self.kind, self.good = kind, good
+        self.asked = 0
         self._random = np.random.default_rng(seed)
 
     def solve(self, problem: GrfProblem) -> Array | None:
+        self.asked += 1
         size = len(problem.gradient)
         match self.kind:
             case "none":
@@ -172,8 +174,13 @@ class SolverFault(Fault):
     def start(self, rig: Rig) -> None:
         ladder = rig.cycle.controller.ladder
         ladder.first = BadSolver(self.first, ladder.first, self.seed)
+        self._bad = [ladder.first]
         if self.second is not None:
             ladder.second = BadSolver(self.second, ladder.second, self.seed)
+            self._bad.append(ladder.second)
+
+    def happened(self) -> bool:
+        return all(solver.asked for solver in self._bad)
 
 
 @dataclass

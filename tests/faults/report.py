@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from faults import process
 from faults.watch import Outcome
 
 SHOWN = 40
@@ -54,6 +55,8 @@ def describe(outcome: Outcome) -> str:
 
 def command(outcome: Outcome) -> str:
     """What shows one fault again."""
+    if outcome.body == "process":
+        return process.command(outcome.row)
     place = f"--body {outcome.body} --gait {outcome.gait} --row {outcome.row} --seed {outcome.seed}"
     return f"python tests/torture.py {place}"
 

@@ -60,6 +60,10 @@ class Fault:
         """
         return measurement
 
+    def happened(self) -> bool:
+        """Whether it reached in at all, at the end."""
+        return True
+
 
 class Body(Protocol):
     """What the rig wants of a body."""

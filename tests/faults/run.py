@@ -111,6 +111,8 @@ def suffer(rig: Rig, case: Case, dice: np.random.Generator) -> Outcome:
         place = traceback.extract_tb(error.__traceback__)[-1]
         watch.violate(f"{type(error).__name__} in {place.name}: {error}")
     watch.judge()
+    if not fault.happened():
+        watch.violate("never happened")
     if row.must == "damp" and (outcome.answered is None or (row.within and outcome.answered > row.within)):
         watch.violate(f"damped in tick {outcome.answered}, bound {row.within}")
     if row.must == "stay" and (outcome.fell or rig.mode is not mode):
