@@ -1,11 +1,13 @@
-"""What every test is held to: no task and no thread outlives it."""
+"""What every test is held to: no task and no thread outlives it. And what several files of tests want."""
 
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -33,3 +35,13 @@ def nothing_leaks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     while (left := [thread for thread in threading.enumerate() if thread not in before]) and time.monotonic() < end:
         time.sleep(0.01)
     assert not left, f"threads left behind: {left}"
+
+
+@pytest.fixture
+def fifo(tmp_path: Path) -> Iterator[tuple[Path, int]]:
+    """A pipe that stands for a pad's event device, and its other end."""
+    path = tmp_path / "event0"
+    os.mkfifo(path)
+    fd = os.open(path, os.O_RDWR)
+    yield path, fd
+    os.close(fd)

@@ -1,249 +1,43 @@
-"""Hands to robot: event bytes through a pipe, the driver's rules, and what a lost driver does to a walking robot."""
+"""Hands to robot: what a driver does to a robot, and what a lost driver does to a walking one."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import os
-import struct
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 
 import pytest
 from daemons import PATIENCE, Served, make_config, until
-from hypothesis import given
-from hypothesis import strategies as st
+from pad_events import (
+    BUMPER,
+    CENTRED,
+    FORWARD,
+    LEFT,
+    REPORT,
+    RISE,
+    TURN,
+    XPAD,
+    B,
+    axis,
+    button,
+)
 
 from runtime import config
 from runtime.control.records import Clamp
 from runtime.messages.mode import Mode, Request
-from runtime.messages.motion import PoseMessage
-from station.driving import LEVEL, STILL, Driving
+from station.driving import Driving
 from station.joystick import Joystick
-from station.keyboard import HOLD_SECONDS, Keys
-from station.pad import EVENT, Pad, PadDevice, SourceLost, Sticks, load_mapping, shipped_mappings, used_axes
-from station.session import Station, StationError, connected
+from station.pad import PadDevice
+from station.session import Station, connected
 
-XPAD = dict(shipped_mappings())["xpad"]
-FORWARD, TURN, LEFT, RISE = 1, 0, 3, 4
-BUMPER, B, BACK = 311, 305, 314
-SHARE = st.floats(-1, 1)
-STICKS = st.builds(Sticks, forward=SHARE, left=SHARE, turn=SHARE, held=st.booleans())
 Script = Callable[[Served, "Desk"], Awaitable[None]]
-MODES = st.sampled_from([*Mode, None])
-
-
-def event(kind: int, code: int, value: int) -> bytes:
-    return struct.pack("@llHHi", 12, 34, kind, code, value)
-
-
-def axis(code: int, value: int) -> bytes:
-    return event(3, code, value)
-
-
-def button(code: int, value: int = 1) -> bytes:
-    return event(1, code, value)
-
-
-REPORT, DROPPED = event(0, 0, 0), event(0, 3, 0)
-CENTRED = axis(FORWARD, 0) + axis(TURN, 0) + axis(LEFT, 0) + REPORT
-
-
-# The pad -------------------------------------------------------------------------------------------------------------
-
-
-def test_an_event_is_twenty_four_bytes_on_this_machine() -> None:
-    assert EVENT.size == 24
-
-
-def test_sticks_are_unknown_until_every_axis_has_spoken() -> None:
-    pad = Pad(XPAD)
-    pad.feed(axis(FORWARD, 0) + axis(TURN, 0))
-    assert pad.sticks is None
-    pad.feed(axis(LEFT, 0))
-    assert pad.sticks == Sticks()
-
-
-def test_up_is_forward_and_left_is_left_and_the_bumper_holds() -> None:
-    pad = Pad(XPAD)
-    pad.feed(axis(FORWARD, -32768) + axis(TURN, -32768) + axis(LEFT, -32768) + button(BUMPER))
-    assert pad.sticks == Sticks(forward=1.0, left=1.0, turn=1.0, held=True)
-    pad.feed(button(BUMPER, 0))
-    assert pad.sticks is not None and not pad.sticks.held
-
-
-@given(st.binary(max_size=30), st.lists(st.integers(1, 30), max_size=20))
-def test_bytes_cut_anywhere_mean_the_same(noise: bytes, cuts: list[int]) -> None:
-    data = CENTRED + axis(FORWARD, -20000) + button(B) + REPORT + button(BUMPER) + button(BACK) + noise
-    whole, parts = Pad(XPAD), Pad(XPAD)
-    wanted = whole.feed(data)
-    got = []
-    for cut in cuts:
-        got += parts.feed(data[:cut])
-        data = data[cut:]
-    got += parts.feed(data)
-    assert (got, parts.sticks) == (wanted, whole.sticks)
-    assert got[:2] == ["walk", "idle"]
-
-
-def test_lost_events_make_the_sticks_unknown_and_release_the_dead_man() -> None:
-    pad = Pad(XPAD)
-    pad.feed(CENTRED + button(BUMPER) + REPORT)
-    assert pad.feed(DROPPED + axis(FORWARD, -32768) + button(B) + REPORT) == []
-    assert pad.sticks is None
-    pad.feed(CENTRED)
-    assert pad.sticks == Sticks(held=False)
-
-
-@given(st.integers(-(2**31), 2**31 - 1), st.integers(-(2**31), 2**31 - 1))
-def test_a_stick_never_asks_for_more_than_all(value: int, other: int) -> None:
-    pad = Pad(XPAD)
-    pad.feed(CENTRED + axis(FORWARD, value) + axis(LEFT, other))
-    sticks = pad.sticks
-    assert sticks is not None
-    assert -1 <= sticks.forward <= 1 and -1 <= sticks.left <= 1
-    assert abs(value) > 32768 * XPAD.dead_zone * 0.99 or sticks.forward == 0
-
-
-@pytest.mark.parametrize("name", [name for name, _ in shipped_mappings()])
-def test_shipped_mappings_give_every_stick_and_button_a_code_of_its_own(name: str) -> None:
-    mapping = dict(shipped_mappings())[name]
-    codes = [getattr(mapping.buttons, field) for field in mapping.buttons.__struct_fields__]
-    assert len(set(codes)) == len(codes) and None not in codes
-    assert len({axis.code for axis in used_axes(mapping).values()}) == 4
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("x = [", "Invalid value|x"),
-        ("[axes]", "forward|required"),
-        ("nonsense = 1", "nonsense"),
-        ("dead_zone = 1.5", "dead_zone|<"),
-    ],
-)
-def test_a_mapping_that_cannot_be_used_is_refused_by_name(tmp_path: Path, text: str, words: str) -> None:
-    path = tmp_path / "pad.toml"
-    path.write_text(text)
-    with pytest.raises(StationError, match=words) as refused:
-        load_mapping(path)
-    assert str(path) in str(refused.value)
-
-
-@pytest.fixture
-def fifo(tmp_path: Path) -> Iterator[tuple[Path, int]]:
-    path = tmp_path / "event0"
-    os.mkfifo(path)
-    fd = os.open(path, os.O_RDWR)
-    yield path, fd
-    os.close(fd)
-
-
-def test_a_pad_that_is_pulled_out_is_lost(fifo: tuple[Path, int]) -> None:
-    path, fd = fifo
-    device = PadDevice(path, XPAD)
-    assert device.read() == []
-    os.write(fd, CENTRED + button(B))
-    assert device.read() == ["walk"]
-    assert device.sticks == Sticks()
-    device.close()
-    with pytest.raises(SourceLost, match="No such file"):
-        PadDevice(path.with_name("event1"), XPAD)
-
-
-# The keyboard --------------------------------------------------------------------------------------------------------
-
-
-def test_a_key_counts_as_held_only_while_it_repeats() -> None:
-    now = 0.0
-    keys = Keys(lambda: now)
-    keys.feed(b"9w")
-    assert keys.sticks.forward == 1.0
-    now = HOLD_SECONDS
-    assert keys.sticks.centred
-
-
-@given(st.binary(max_size=50))
-def test_any_bytes_from_the_terminal_are_borne(data: bytes) -> None:
-    keys = Keys()
-    for name in keys.feed(data):
-        assert name in ("pose", "gait") or Driving.requests(name, keys.sticks, armed=False)
-    assert all(abs(share) <= 1 for share in (keys.sticks.forward, keys.sticks.left, keys.sticks.turn))
-
-
-# The rules -----------------------------------------------------------------------------------------------------------
-
-
-@given(st.lists(st.tuples(st.one_of(st.none(), STICKS), MODES), max_size=60))
-def test_nothing_moves_before_the_sticks_were_centred_nor_without_the_dead_man(
-    script: list[tuple[Sticks | None, Mode | None]],
-) -> None:
-    driving = Driving(1.0, 1.0, 1.0)
-    centred_since_loss = False
-    for sticks, mode in script:
-        velocity = driving.velocity(sticks, mode)
-        if mode is not Mode.WALK or sticks is None or (not sticks.held and not sticks.centred):
-            centred_since_loss = False
-        elif sticks.centred:
-            centred_since_loss = True
-        if mode is not Mode.WALK:
-            assert velocity is None
-        elif sticks is None or not sticks.held or not centred_since_loss:
-            assert velocity == STILL
-        else:
-            assert velocity == (sticks.forward, sticks.left, sticks.turn)
-
-
-@given(st.lists(st.tuples(st.one_of(st.none(), STICKS), MODES, st.booleans()), max_size=60))
-def test_the_body_leans_only_in_stand_after_the_button_once_centred_with_the_dead_man(
-    script: list[tuple[Sticks | None, Mode | None, bool]],
-) -> None:
-    driving = Driving(1.0, 1.0, 1.0)
-    for sticks, mode, pressed in script:
-        if pressed:
-            said = driving.toggle_pose(mode)
-            assert (said is None) == driving.posing and (not driving.posing or mode is Mode.STAND)
-        before = driving.centred
-        pose, velocity = driving.pose(sticks, mode), driving.velocity(sticks, mode)
-        assert pose is None or velocity is None, "the sticks mean one thing"
-        if mode is not Mode.STAND:
-            assert pose is None
-        if pose is not None and pose != LEVEL and sticks is not None and sticks.held:
-            assert before or sticks.level or driving.centred
-
-
-def test_the_sticks_lean_the_body_the_way_they_are_pushed_and_let_go_it_stays() -> None:
-    driving = Driving(1.0, 1.0, 1.0)
-    driving.toggle_pose(Mode.STAND)
-    pushed = Sticks(forward=0.5, left=0.4, turn=0.3, rise=-0.2, held=True)
-    assert driving.pose(pushed, Mode.STAND) == LEVEL, "the sticks were never centred"
-    driving.pose(Sticks(held=True), Mode.STAND)
-    assert driving.pose(pushed, Mode.STAND) == PoseMessage(roll=-0.3, pitch=0.5, yaw=0.4, height=-0.2)
-    assert driving.pose(Sticks(held=False), Mode.STAND) == PoseMessage(-0.3, 0.5, 0.4, -0.2)
-    assert driving.toggle_pose(Mode.STAND) == LEVEL
-    assert driving.pose(pushed, Mode.STAND) is None
-
-
-def test_the_gait_button_goes_through_the_mapping_s_gaits() -> None:
-    driving = Driving(1.0, 1.0, 1.0, ("trot", "pace"))
-    assert [driving.next_gait() for _ in range(3)] == ["pace", "trot", "pace"]
-
-
-def test_standing_up_arms_only_with_the_dead_man_held() -> None:
-    assert Driving.requests("stand", Sticks(held=False), armed=False) == [Request.STAND]
-    assert Driving.requests("stand", None, armed=False) == [Request.STAND]
-    assert Driving.requests("stand", Sticks(held=True), armed=False) == [Request.ARM, Request.STAND]
-    assert Driving.requests("idle", None, armed=True) == [Request.DAMP]
-
-
-# With a daemon -------------------------------------------------------------------------------------------------------
-
-
 EXPIRY = 3.0
 """s, more than a busy machine pauses."""
 
