@@ -46,6 +46,8 @@ RUN_DTYPE = np.dtype(
 _SYMBOL = np.dtype(
     [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("at", "<u8"), ("size", "<u8")]
 )
+_ELF = b"\x7fELF\x02\x01"
+"""How a library of 64 bits, low byte first, begins."""
 _SYMBOL_TABLE = 2
 _HIDDEN, _EXPORTED = b"getPhysicsClient", b"b3CanSubmitCommand"
 _PLACE = types.intp  # a pointer
@@ -149,6 +151,8 @@ def touch(memory):  # type: ignore[no-untyped-def]
 def _places(library: Path) -> tuple[int, int] | None:
     """Where ``getPhysicsClient`` and an exported neighbour lie in the library; None where it does not tell."""
     with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as image:
+        if image[:6] != _ELF:
+            return None
         start, count = struct.unpack_from("<Q", image, 40)[0], struct.unpack_from("<H", image, 60)[0]
         sections = [struct.unpack_from("<IIQQQQIIQQ", image, start + 64 * index) for index in range(count)]
         for _, kind, _, _, offset, size, link, *_ in sections:
