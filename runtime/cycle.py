@@ -269,7 +269,7 @@ class Cycle:
         if mode is _STAND or mode is _WALK:
             status = int(self._row["solver_status"])
             self.solver[status] += 1
-            reason = self.guard.judge_policy(self.tick)
+            reason = self.guard.judge_plan(self.tick)
             if reason is _OK and status == _FAILED:
                 reason = _SOLVER_FAILED
         if reason is _OK:
@@ -369,6 +369,7 @@ class Cycle:
             moving = before.mode is _WALK or (before.mode is _STAND and not self._settled(_STAND))
             self._record.blank_plan()
             now = float(self._row["stamp"])
-            self.sources.change(before.mode, state.mode, measurement, state.reason.is_fault, now, moving)
+            falls = state.reason is Reason.FALLING
+            self.sources.change(before.mode, state.mode, measurement, state.reason.is_fault, now, moving, falls)
         elif state.armed != before.armed or state.fault is not before.fault:
             self.note("mode", f"{state.mode.name}: {state.reason.words}")

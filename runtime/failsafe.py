@@ -214,6 +214,14 @@ TABLE: tuple[Fault, ...] = (
         "1",
         f"{LIMITS}::test_low_voltage",
     ),
+    Fault(
+        "it is knocked over, and no step would catch it",
+        Reason.FALLING,
+        "limits.judge_fall",
+        "1",
+        "tests/test_soft_fall.py::test_a_robot_that_is_knocked_over_is_low_before_it_lands",
+        "folds its legs at once (`posture.tuck_time`), damps",
+    ),
     Fault("it tips over", Reason.TILTED, "limits.judge_body", "1", INJECTED),
     Fault(
         "the policy asks for what is not a number, or huge",

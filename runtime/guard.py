@@ -13,7 +13,7 @@ from runtime.control.parameters import BoundsConfig
 from runtime.control.records import Clamp, Records
 from runtime.derating import derate_joint, derate_speed, ramp_up
 from runtime.encoders import look_at_encoder
-from runtime.limits import bound_command, judge_body, judge_joint, judge_load, judge_policy
+from runtime.limits import bound_command, judge_body, judge_fall, judge_joint, judge_load, judge_policy
 from runtime.messages.fault import Evidence
 from runtime.messages.tick import TICK_DTYPE
 from runtime.modes import Reaction, Reason, reaction
@@ -71,6 +71,13 @@ def keep_command(ticks, memories):  # type: ignore[no-untyped-def]
     m.commands[0, 3], m.commands[0, 4] = t.command_kd, t.command_torque
 
 
+@compiled
+def judge_plan(ticks, bounds, memories):  # type: ignore[no-untyped-def]
+    """What the controller found and the policy asked for in ``ticks`` (1,): OK, or what is wrong with it."""
+    reason = judge_policy(ticks, bounds, memories)
+    return reason if reason != 0 else judge_fall(ticks, bounds, memories)
+
+
 class Guard:
     """The bounds of one robot, and the memory of what was measured and borne."""
 
@@ -111,7 +118,7 @@ class Guard:
         """Forget everything, and compile all kernels on a blank tick."""
         blank = np.zeros(1, TICK_DTYPE)
         judge(blank, self.bounds, self.memory, self._raw)
-        judge_policy(blank, self.bounds, self.memory)
+        judge_plan(blank, self.bounds, self.memory)
         bound_command(blank, self.bounds, self.memory)
         keep_command(blank, self.memory)
         self.forget()
@@ -120,9 +127,9 @@ class Guard:
         """OK, or the worst reason to give up in the measurement of this tick's record (1,)."""
         return _REASONS[judge(ticks, self.bounds, self.memory, self._raw)]
 
-    def judge_policy(self, ticks: Records) -> Reason:
-        """OK, or BAD_POLICY, from what the policy asked for in the tick's record (1,)."""
-        return _REASONS[judge_policy(ticks, self.bounds, self.memory)]
+    def judge_plan(self, ticks: Records) -> Reason:
+        """OK, BAD_POLICY or FALLING, from estimate and action in the tick's record (1,)."""
+        return _REASONS[judge_plan(ticks, self.bounds, self.memory)]
 
     def bound(self, ticks: Records) -> Reason:
         """Cut the feed-forward torque in the tick's record (1,); OK, or BAD_COMMAND."""
@@ -221,7 +228,7 @@ class Guard:
         b["tracking_error"], b["tracking_time"] = limits.max_tracking_error, limits.tracking_time
         b["stuck_time"], b["stuck_motion"] = limits.stuck_time - 0.5 * period, limits.stuck_motion
         b["stuck_tilt"], b["stuck_told"] = limits.stuck_tilt, limits.stuck_told
-        b["roughness"] = limits.max_roughness
+        b["roughness"], b["overreach"] = limits.max_roughness, limits.max_overreach
         b["stuck_torque"], b["clamped_torque"] = limits.stuck_torque, limits.clamped_torque
         b["stop_lower"] = np.array(description.joints.lower) + limits.joint_margin
         b["stop_upper"] = np.array(description.joints.upper) - limits.joint_margin
@@ -266,6 +273,7 @@ _UNITS: dict[Reason, tuple[float, int, str]] = {
     Reason.REVERSED_MOTOR: (1.0, 2, "of the commanded torque"),
     Reason.ASTRAY: (1.0, 2, "rad"),
     Reason.STALLED: (1e3, 0, "ms"),
+    Reason.FALLING: (1.0, 2, "m"),
     Reason.LATE_LOOP: (1e3, 0, "ms"),
     Reason.BAD_POLICY: (1.0, 1, "m, N or N·m"),
     Reason.BAD_COMMAND: (1.0, 1, "N·m"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from runtime.control.compilation import compiled
+from runtime.control.kinematics import GRAVITY
 from runtime.control.records import Clamp
 from runtime.messages.mode import Mode
 from runtime.modes import Reason
@@ -35,7 +36,16 @@ _JOINT_SPEED, _LOW_VOLTAGE, _OVERLOAD, _BAD_COMMAND, _BAD_POLICY = (
         Reason.BAD_POLICY,
     )
 )
-_WALK = int(Mode.WALK)
+_STAND, _WALK = int(Mode.STAND), int(Mode.WALK)
+_FALLING = int(Reason.FALLING)
+AHEAD = 0.1
+"""s for which the lean is foreseen, from the rate of turn."""
+LEVER = 0.5
+"""m that the capture point is taken to be further out for each radian of lean."""
+SETTLED = 0.5
+"""s after standing up for which the estimate's speed is not yet one to fall by."""
+LOWEST = 0.2
+"""m: no estimate of the height below it makes a pendulum."""
 _LATE_LOOP, _STALLED = int(Reason.LATE_LOOP), int(Reason.STALLED)
 _TORQUE, _COASTED = int(Clamp.TORQUE), int(Clamp.COASTED)
 
@@ -70,6 +80,7 @@ def judge_body(t, b, m):  # type: ignore[no-untyped-def]
     upright = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
     if upright < b.cos_tilt:
         find(m, b, _TILTED, -1, math.acos(max(-1.0, upright)), math.acos(b.cos_tilt))
+    m.upright = m.upright + b.period if t.mode == _STAND or t.mode == _WALK else 0.0
     if not math.isfinite(t.voltage):
         find(m, b, _NOT_FINITE, -1, t.voltage, 0.0)
     elif t.voltage < b.voltage:
@@ -100,6 +111,34 @@ def judge_policy(ticks, bounds, memories):  # type: ignore[no-untyped-def]
             find(m, b, _BAD_POLICY, -1, asked, b.action[i])
             return _BAD_POLICY
     return _OK
+
+
+@compiled
+def judge_fall(ticks, bounds, memories):  # type: ignore[no-untyped-def]
+    """Whether the robot of ``ticks`` (1,) can still be caught, from this tick's estimate: OK, or FALLING.
+
+    The capture point is where a foot would have to be put to bring an inverted pendulum of the body's height and speed
+    to rest above it. It may leave the feet by what a step makes good, and no lean makes it worse.
+    """
+    t, b, m = ticks[0], bounds[0], memories[0]
+    speed = math.hypot(t.twist[0], t.twist[1])
+    if m.upright < SETTLED or not speed > 0.0:
+        return _OK
+    x, y = t.twist[0] / speed, t.twist[1] / speed
+    reach = -math.inf
+    for leg in range(4):
+        reach = max(reach, t.feet[leg, 0] * x + t.feet[leg, 1] * y)
+    sine, cosine = math.sin(t.rpy[1]), math.cos(t.rpy[1])
+    up_x, up_y, up_z = sine * math.cos(t.rpy[0]), -math.sin(t.rpy[0]), cosine * math.cos(t.rpy[0])
+    lean = up_x * x + up_y * y
+    tipping = (t.twist[4] * up_z - t.twist[5] * up_y) * x + (t.twist[5] * up_x - t.twist[3] * up_z) * y
+    overreach = speed * math.sqrt(max(LOWEST, t.height) / GRAVITY) - reach + LEVER * (lean + AHEAD * tipping)
+    bound = b.overreach[1 if t.mode == _WALK else 0]
+    if not overreach > bound:
+        return _OK
+    m.severity = 0
+    find(m, b, _FALLING, -1, overreach, bound)
+    return _FALLING
 
 
 @compiled

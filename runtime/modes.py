@@ -67,6 +67,7 @@ class Reason(IntEnum):
     ASTRAY = 64
     STUCK_ENCODER = 65
     LYING_CONTACTS = 66
+    FALLING = 67
 
     @property
     def words(self) -> str:
@@ -128,6 +129,7 @@ WORDS: dict[Reason, str] = {
     Reason.ASTRAY: "a joint does not follow its target",
     Reason.STUCK_ENCODER: "an encoder does not move any more",
     Reason.LYING_CONTACTS: "more than one foot feels what cannot be",
+    Reason.FALLING: "falls, and no step would catch it",
 }
 
 
@@ -160,6 +162,7 @@ SEATED = frozenset(
         Reason.BAD_COMMAND,
         Reason.BAD_POLICY,
         Reason.SOLVER_FAILED,
+        Reason.FALLING,
     }
 )
 """Faults that leave every leg answering."""

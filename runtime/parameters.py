@@ -86,6 +86,9 @@ class LimitsConfig(Record, frozen=True, kw_only=True):
     """Time constant of that mean, s."""
     policy_bound: Annotated[float, Meta(ge=1)] = 10.0
     """A policy that asks for more than so many times its own bounds is broken."""
+    max_overreach: tuple[Positive, Positive] = (0.35, 0.9)
+    """A standing, a walking robot falls for good once its capture point, with half a metre for each radian of lean, is
+    this far beyond its feet, m."""
     stall_stand: Positive = 0.05
     """A tick that comes later than this after the one before stops the walk, s."""
     stall_damp: Positive = 0.1
@@ -148,6 +151,10 @@ class PostureConfig(Record, frozen=True, kw_only=True):
     """Share of the stiffness meanwhile."""
     brace_damping: Annotated[float, Meta(gt=0, le=2)] = 0.75
     """Share of the damping meanwhile."""
+    tuck_time: Positive = 0.15
+    """What one that falls takes to fold them, s."""
+    tuck_gain: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    """Share of stiffness and damping meanwhile."""
     fold_height: Annotated[float, Meta(gt=0, lt=1)] = 0.3
     """Foot to hip when folded, as a share of thigh + shank."""
 

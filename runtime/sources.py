@@ -78,11 +78,18 @@ class Sources:
         return self.fall
 
     def change(
-        self, before: Mode, after: Mode, measurement: Measurement | None, fault: bool, now: float, moving: bool = False
+        self,
+        before: Mode,
+        after: Mode,
+        measurement: Measurement | None,
+        fault: bool,
+        now: float,
+        moving: bool = False,
+        falls: bool = False,
     ) -> None:
         """Make ready for a mode that differs from the one before; without a measurement it is DAMP.
 
-        ``moving``: it walks, or stands on less than four feet.
+        ``moving``: it walks, or stands on less than four feet; ``falls``: and cannot be caught any more.
         """
         self.hand_over()
         if _DAMP in (before, after):
@@ -93,7 +100,7 @@ class Sources:
         elif after is _STAND_UP:
             self.posture.stand_up(measurement)
         elif after is _SIT_DOWN and moving:
-            self.posture.brace(measurement)
+            self.posture.brace(measurement, falls)
             self.blend_left = 0.0
         elif after is _SIT_DOWN:
             self.posture.sit_down(measurement, bearing=before in (_STAND, _WALK))

@@ -54,6 +54,7 @@ BOUNDS_DTYPE = np.dtype(
         ("stuck_tilt", "f8"),  # change of gravity's direction in the body
         ("stuck_told", "f8"),
         ("roughness", "f8"),
+        ("overreach", "f8", (2,)),  # standing, walking
         ("stop_lower", "f8", (4, 3)),  # between these no end stop holds a joint
         ("stop_upper", "f8", (4, 3)),
         ("action", "f8", (18,)),
@@ -106,6 +107,7 @@ MEMORY_DTYPE = np.dtype(
         ("still_tilt", "f8", (4, 3)),  # gravity's direction then, along the axis across which it would move the joint
         ("told", "f8", (4, 3)),  # way that its target has gone since then, rad
         ("commands", "f8", (2, 5, 4, 3)),  # of the last tick and the one before
+        ("upright", "f8"),  # s for which it has stood or walked
         # punctuality
         ("overruns", "u4"),
         ("missed", "f8"),  # share of missed ticks lately

@@ -395,7 +395,7 @@ def test_a_step_of_the_bodys_clock_is_nothing(step: float) -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1e6])
 def test_a_policy_that_asks_for_what_cannot_be_is_found(name: str, value: float) -> None:
     guard, tick = make_guard(), healthy()
-    assert guard.judge_policy(tick) is Reason.OK
+    assert guard.judge_plan(tick) is Reason.OK
     tick["asked"][0, {"position": 4, "force": 13, "moment": 17}[name]] = value
-    assert guard.judge_policy(tick) is Reason.BAD_POLICY
+    assert guard.judge_plan(tick) is Reason.BAD_POLICY
     assert guard.evidence(Reason.BAD_POLICY).bound == {"position": 1.5, "force": 2500.0, "moment": 1000.0}[name]

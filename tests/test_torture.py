@@ -122,7 +122,7 @@ def test_the_watch_sees_a_guard_that_looks_away(walking: Rig, fault: Fault) -> N
 
 
 def test_the_watch_sees_a_robot_that_lies_there_and_walks_on(walking: Rig) -> None:
-    for net in ("judge", "judge_policy", "bound"):
+    for net in ("judge", "judge_plan", "bound"):
         setattr(walking.cycle.guard, net, lambda *_: Reason.OK)
     violations = " ".join(suffer(walking, WildPolicy(1e4, 1), 400).violations)
     assert "lay on the ground" in violations

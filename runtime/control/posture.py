@@ -40,6 +40,10 @@ class PostureTimes(Protocol):
     def brace_gain(self) -> float: ...  # noqa: D102
     @property
     def brace_damping(self) -> float: ...  # noqa: D102
+    @property
+    def tuck_time(self) -> float: ...  # noqa: D102
+    @property
+    def tuck_gain(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,16 +178,19 @@ class Posture:
             ]
         )
 
-    def brace(self, measurement: Measurement) -> None:
+    def brace(self, measurement: Measurement, falls: bool = False) -> None:
         """Plan the quick way down of a robot that moves: joint by joint to folded, soft, bearing less and less.
 
-        Needs neither attitude nor contact nor a controller.
+        One that ``falls`` does it at once and stiffly, so that it is low before it lands. Needs neither attitude nor
+        contact nor a controller.
         """
-        q, times = measurement.joints.position, self.times
-        folded, gain, damping = self.folded_joints, times.brace_gain, times.brace_damping
+        q, times, folded = measurement.joints.position, self.times, self.folded_joints
+        duration = times.tuck_time if falls else times.brace_time
+        gain = times.tuck_gain if falls else times.brace_gain
+        damping = times.tuck_gain if falls else times.brace_damping
         self._begin(
             [
-                Segment(times.brace_time, q, folded, False, (gain, gain), (1.0, 0.0), damping),
+                Segment(duration, q, folded, False, (gain, gain), (1.0, 0.0), damping),
                 Segment(times.soft_start, folded, folded, False, (gain, 0.0), (0.0, 0.0), damping),
             ]
         )
