@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 from faults.report import shown
-from faults.shift import Shift, missed_share, work
+from faults.shift import Shift, share, work
 from faults.wander import Wandering, wander
 from faults.workers import spread
 from rich.console import Console
@@ -62,7 +62,12 @@ def _print_shift(shift: Shift, problems: list[str]) -> None:
     table = Table(box=None, show_header=False, padding=(0, 1, 0, 0))
     for name, value in (
         ("walked", f"{shift.minutes:g} min, {shift.distance:.0f} m"),
-        ("ticks", f"{shift.ticks}, missed {shift.missed} ({100 * missed_share(shift):.2f} %)"),
+        ("ticks", f"{shift.ticks}, missed {shift.missed} ({100 * share(shift.missed, shift.ticks):.2f} %)"),
+        (
+            "calm",
+            f"{shift.calm} of them while the host took no time, missed {shift.calm_missed}"
+            f" ({100 * share(shift.calm_missed, shift.calm):.2f} %)",
+        ),
         ("wires", ", ".join(f"{count} {name}" for name, count in shift.wires.items()) or "nothing lost, nothing late"),
         ("memory", f"{shift.resident:.1f} MiB, grew by {shift.growth:.2f}, bound {GROWTH:g}"),
         ("falls", str(shift.falls)),

@@ -21,11 +21,13 @@ import psutil
 from runtime import config
 from runtime.messages.mode import Mode, Request
 from runtime.messages.simulation import SimTruth
+from runtime.messages.status import Status
 from station.driving import Driving
 from station.joystick import Joystick
 from station.pad import Sticks
 from station.requests import request, set_off
 from station.session import Station, StationError, connected, free_endpoint
+from trotd.bench.host import stolen_time
 from trotd.tour import running_twin
 
 SETTLING = 0.1
@@ -46,6 +48,10 @@ class Shift(msgspec.Struct, kw_only=True):
     ticks: int = 0
     missed: int = 0
     """Ticks whose deadline went by."""
+    calm: int = 0
+    """Ticks between two statuses between which the machine's host took no processor time."""
+    calm_missed: int = 0
+    """Of them."""
     growth: float = 0.0
     """Of the daemon's resident memory after the settling, MiB."""
     resident: float = 0.0
@@ -149,12 +155,14 @@ def _drive(station: Station, daemon: subprocess.Popen[bytes], shift: Shift, show
     start, before, mode, fallen = time.monotonic(), None, Mode.WALK.name, False
     spoken = looked = 0.0
     base: int | None = None
+    heard: Status | None = None
+    stolen = stolen_time()
 
     def more() -> bool:
         return time.monotonic() - start < seconds and daemon.poll() is None
 
     def look(joystick: Joystick) -> None:
-        nonlocal before, mode, fallen, spoken, looked, base
+        nonlocal before, mode, fallen, spoken, looked, base, heard, stolen
         now = time.monotonic() - start
         with lock:
             new, truths[:] = list(truths), []
@@ -167,6 +175,12 @@ def _drive(station: Station, daemon: subprocess.Popen[bytes], shift: Shift, show
         if status is not None:
             base = status.overruns if base is None else base
             shift.ticks, shift.missed, shift.wires = status.ticks, status.overruns - base, status.wires
+            if heard is None or status.ticks > heard.ticks:
+                taken = stolen_time()
+                if heard is not None and taken == stolen:
+                    shift.calm += status.ticks - heard.ticks
+                    shift.calm_missed += status.overruns - heard.overruns
+                heard, stolen = status, taken
             if status.mode != mode:
                 mode = status.mode
                 shift.ends.append(f"{now:.0f} s {mode}: {status.fault or status.reason}")
@@ -226,6 +240,6 @@ def _reached(robot: str, endpoint: str, daemon: subprocess.Popen[bytes]) -> Iter
         yield station
 
 
-def missed_share(shift: Shift) -> float:
+def share(missed: int, ticks: int) -> float:
     """Of the ticks, how many went by without one of their own."""
-    return shift.missed / max(1, shift.ticks)
+    return missed / max(1, ticks)
