@@ -32,6 +32,8 @@ from trotd.tour import running_twin
 
 SETTLING = 0.1
 """Share of the time, from the start, in which memory may still grow: buffers fill, the ring's pages are touched."""
+LEAST_SPEED = 0.1
+"""m/s on the mean; one that only marks time proves little."""
 START_TIMEOUT = 300.0
 """s; the first start of all compiles the core."""
 STEADY = 5.0
@@ -70,6 +72,8 @@ class Shift(msgspec.Struct, kw_only=True):
         """What of it was not as it must be."""
         problems = [f"ended: {end}" for end in self.ends]
         problems += [f"{name}: {end}" for name, end in self.clients.items() if end]
+        if self.distance < LEAST_SPEED * 60.0 * self.minutes:
+            problems.append(f"walked {self.distance:.0f} m only, in {self.minutes:g} min")
         if self.growth > growth:
             problems.append(f"memory grew by {self.growth:.1f} MiB, bound {growth:g}")
         if self.falls:
@@ -98,7 +102,12 @@ class Hands:
         t = time.monotonic() - self._start
         if t % 10.0 < 1.5:
             return Sticks(held=True)
-        return Sticks(0.3 + 0.3 * math.sin(0.21 * t), 0.3 * math.sin(0.37 * t), 0.4 * math.sin(0.13 * t), True)
+        return Sticks(
+            forward=0.3 + 0.3 * math.sin(0.21 * t),
+            left=0.3 * math.sin(0.37 * t),
+            turn=0.4 * math.sin(0.13 * t),
+            held=True,
+        )
 
     def close(self) -> None:
         for fd in (self._near, self._far):
