@@ -352,10 +352,10 @@ def _arm(state: ModeState, verdict: Reason, ready: bool) -> Answer:
 def _move(state: ModeState, entry: Entry, verdict: Reason) -> Answer:
     if isinstance(entry, Reason):
         return Answer(state, entry is Reason.ALREADY, entry)
-    if not state.armed:
-        return _refused(state, Reason.NOT_ARMED)
     if state.fault is not Reason.OK:
         return _refused(state, Reason.FAULT_STANDS)
+    if not state.armed:
+        return _refused(state, Reason.NOT_ARMED)
     if verdict is not Reason.OK:
         return _refused(state, verdict)
     return Answer(replace(state, mode=entry, reason=Reason.REQUESTED), True, Reason.REQUESTED)
