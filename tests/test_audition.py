@@ -18,7 +18,8 @@ from runtime.policies import PolicyError, check_manifest, find_policy, load
 from runtime.replay import replay
 from runtime.shelf import PolicyFile, Shelf
 
-BALANCE = load(find_policy("balance"), "stoch3")
+ACTIVE = load(find_policy("trot"), "stoch3")
+"""Stoch3's own, which every outing sets out with."""
 VELOCITY = (0.5, 0.0, 0.0)
 random = np.random.default_rng(1)
 HOSTILE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -29,8 +30,8 @@ HOSTILE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def candidate(name: str, change: Callable[[np.ndarray], np.ndarray], **changes: object) -> PolicyFile:
-    matrix = change(np.array(BALANCE.matrix))
-    policy = msgspec.structs.replace(BALANCE, name=name, matrix=tuple(map(tuple, matrix.tolist())), **changes)
+    matrix = change(np.array(ACTIVE.matrix))
+    policy = msgspec.structs.replace(ACTIVE, name=name, matrix=tuple(map(tuple, matrix.tolist())), **changes)
     return PolicyFile(policy, encode_policy(policy))
 
 
@@ -81,7 +82,7 @@ class Trial:
 
     def stands_firm(self) -> bool:
         mode = Mode.STAND if self.velocity is None else Mode.WALK
-        return self.walk.cycle.state.mode is mode and self.tilt < 0.15 and not self.walk.world.fallen()
+        return self.walk.cycle.state.mode is mode and self.tilt < 0.25 and not self.walk.world.fallen()
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -91,7 +92,7 @@ def test_a_hostile_candidate_in_the_walk_is_given_up_before_the_robot_falls(tmp_
     trial.run(4.0)
     (verdict,) = trial.verdicts
     assert not verdict.accepted and "foreseen tilt" in verdict.words, verdict
-    assert trial.walk.cycle.policy is BALANCE or trial.walk.cycle.policy == BALANCE
+    assert trial.walk.cycle.policy is ACTIVE or trial.walk.cycle.policy == ACTIVE
     assert trial.walk.cycle.generation == 3 and trial.stands_firm(), trial.tilt
     assert trial.audition.stage is None and not hasattr(trial.shelf, "kept")
 
@@ -112,7 +113,7 @@ def test_a_candidate_that_only_stands_is_given_up_in_its_first_walk(tmp_path: Pa
     assert trial.verdicts[0].accepted and "proved while standing" in trial.verdicts[0].words
     trial.set_off()
     trial.run(3.0)
-    assert trial.walk.cycle.policy == BALANCE and not hasattr(trial.shelf, "kept")
+    assert trial.walk.cycle.policy == ACTIVE and not hasattr(trial.shelf, "kept")
     assert not trial.walk.world.fallen() and trial.tilt < 0.4, trial.tilt
 
 
@@ -125,7 +126,7 @@ def test_a_flipped_one_is_given_up_while_standing(tmp_path: Path) -> None:
 
 def test_a_good_one_takes_over_without_a_jump_and_all_of_it_replays(tmp_path: Path) -> None:
     trial = Trial(tmp_path, True)
-    good = candidate("better", lambda matrix: 1.1 * matrix, shift_time_constant=0.04, terms=BALANCE.terms)
+    good = candidate("better", lambda matrix: 1.1 * matrix, shift_time_constant=0.04, terms=ACTIVE.terms)
     trial.offer(good)
     shares: list[float] = []
     step = trial.walk.after
@@ -190,7 +191,7 @@ def test_a_robot_that_damps_during_the_trial_has_its_policy_back(tmp_path: Path)
     trial.run(0.02)
     assert trial.walk.cycle.state.mode is Mode.DAMP
     assert not trial.verdicts[0].accepted and "the robot damped: a joint is too fast" in trial.verdicts[0].words
-    assert trial.walk.cycle.policy == BALANCE
+    assert trial.walk.cycle.policy == ACTIVE
 
 
 def test_sitting_down_in_the_shadow_ends_the_audition(tmp_path: Path) -> None:

@@ -233,7 +233,7 @@ def test_a_joystick_that_is_killed_stops_the_walk(tmp_path: Path) -> None:
             assert served.daemon.cycle.state.mode is Mode.WALK
             pad.kill()
             await served.reach(Mode.STAND)
-        assert any("operator is gone" in event.text for event in served.daemon.link.history)
+        await served.until(lambda: any("operator is gone" in event.text for event in served.daemon.link.history))
 
     assert ended_in_damp(serve(tmp_path, act))
 
