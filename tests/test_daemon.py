@@ -316,8 +316,9 @@ def test_an_operator_that_goes_away_stops_the_walk(tmp_path: Path) -> None:
         await served.client(come_and_go)
         await served.reach(Mode.STAND)  # the command itself is believed for ten minutes
         await until(lambda: any("operator is gone" in event.text for event in served.daemon.link.history))
+        assert served.daemon.cycle.state.mode is Mode.STAND and not served.daemon.status().fault
 
-    serve(tmp_path, act)
+    assert ended_in_damp(serve(tmp_path, act).body)
 
 
 def test_overruns_are_told(tmp_path: Path) -> None:
@@ -327,7 +328,8 @@ def test_overruns_are_told(tmp_path: Path) -> None:
         served.body.before = lambda _body: time.sleep(0.012)
         await served.until(lambda: served.daemon.status().overruns >= 5)
 
-    serve(tmp_path, act)
+    served = serve(tmp_path, act)
+    assert served.daemon.status().overruns >= 5 and ended_in_damp(served.body)
 
 
 def test_the_watchdog_is_fed_by_the_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 from test_plausibility import PERIOD, Change, Stream
 
@@ -47,32 +49,31 @@ def at_rest(stream: Stream, change: Change) -> Change:
     return stand
 
 
-def test_an_encoder_that_stands_still_while_its_joint_is_told_to_move_is_found_at_once() -> None:
+def told_to_swing(stuck: Callable[[int], bool], age: Callable[[int], float]) -> tuple[Stream, Change]:
+    """A walk in which one knee is told to move at 8 rad/s, and when it does not; and how old its reading is then."""
     stream = Stream(Mode.WALK)
     stream.live(50)
     stick = hold(stream, 2, 2)
 
     def swing(tick: Records, n: int) -> None:
         tick["command_velocity"][0, 2, 2] = 8.0
-        stick(tick, n)
+        if stuck(n):
+            stick(tick, n)
+            tick["joint_age"][0, 2, 2] = age(n)
 
+    return stream, swing
+
+
+def test_an_encoder_that_stands_still_while_its_joint_is_told_to_move_is_found_at_once() -> None:
+    stream, swing = told_to_swing(lambda _n: True, lambda _n: 0.0)
     found, reason = stream.live(20, swing)
     assert reason is Reason.STUCK_ENCODER and found <= 6, "two ticks until the command acts, and 0.08 rad at 8 rad/s"
     assert "BL knee" in stream.guard.explain(reason)
 
 
 def test_replies_that_are_late_or_lost_are_no_stuck_encoder() -> None:
-    stream = Stream(Mode.WALK)
-    stream.live(50)
-    stick = hold(stream, 2, 2)
-
-    def lose(tick: Records, n: int) -> None:
-        tick["command_velocity"][0, 2, 2] = 8.0
-        if n % 3:
-            stick(tick, n)
-            tick["joint_age"][0, 2, 2] = PERIOD * (n % 3)
-
-    assert stream.live(2, lose) == (0, Reason.OK)
+    stream, swing = told_to_swing(lambda n: n % 3 > 0, lambda n: PERIOD * (n % 3))
+    assert stream.live(2, swing) == (0, Reason.OK)
 
 
 @pytest.mark.parametrize(("joint", "trips"), [(0, True), (1, False)])

@@ -120,7 +120,8 @@ def test_thousands_of_commands_cost_the_loop_one_each_tick(tmp_path: Path) -> No
         await served.until(lambda: taken + shed[SHED] == 5000)
         await served.until(lambda: served.daemon.cycle.tick["asked_velocity"][0, 0] == 4999 * 1e-5)
 
-    serve(tmp_path, script, command__expiry=600.0)
+    served = serve(tmp_path, script, command__expiry=600.0)
+    assert 0 < taken <= 5000 and taken + served.daemon.link.entrance.refused[SHED] == 5000
 
 
 READER = """

@@ -265,8 +265,9 @@ def test_a_refusal_is_shown_with_its_reason(tmp_path: Path, fifo: tuple[Path, in
         desk.send(CENTRED + button(B))
         await until(lambda: any(event.kind == "refused" for event in served.daemon.link.history))
         await until(lambda: "walk: refused: not standing: ask for stand first" in desk.said)
+        assert served.daemon.cycle.state.mode is Mode.DAMP
 
-    _serve_and_drive(tmp_path, fifo, script)
+    assert "walk: refused: not standing: ask for stand first" in _serve_and_drive(tmp_path, fifo, script)
 
 
 def test_a_driver_that_leaves_makes_a_walking_robot_stand(tmp_path: Path) -> None:
