@@ -21,7 +21,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 def source_digest(package: str) -> str:
-    """Digest of every source file that compiled code of ``package`` may call: its own room's and those below, with their corners."""
+    """Digest of every source file that compiled code of ``package`` may call, sub-folders and rooms below included."""
     below = {"guard": ("runtime",), "sim": ("sim",), "training": ("sim", "training")}.get(package, ())
     digest = hashlib.sha256()
     for room in ("drivers", "runtime/control", *below):
