@@ -21,11 +21,11 @@ _ROOT = Path(__file__).parents[2]
 
 
 def source_digest(package: str) -> str:
-    """Digest of every source file that compiled code of ``package`` may call, sub-folders and rooms below included."""
+    """Digest of every source file that compiled code of ``package`` may call: its own room's and those below."""
     below = {"guard": ("runtime",), "sim": ("sim",), "training": ("sim", "training")}.get(package, ())
     digest = hashlib.sha256()
     for room in ("drivers", "runtime/control", *below):
-        for path in sorted((_ROOT / room).rglob("*.py")):
+        for path in sorted((_ROOT / room).glob("*.py")):
             text = path.read_bytes()
             if room != "runtime" or b"@compiled" in text:
                 digest.update(path.name.encode())

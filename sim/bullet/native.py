@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
+import numba
 import numpy as np
 from numba import types
-
-from runtime.control.compilation import compiled
 
 TORQUE_CONTROL = 1
 """``b3ControlMode`` of that name."""
@@ -43,7 +42,7 @@ RUN_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""A robot in the engine, and its state."""
+"""A robot in the engine, and its state. Nothing here comes from another file: numba's cache looks at this one alone."""
 _SYMBOL = np.dtype(
     [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("at", "<u8"), ("size", "<u8")]
 )
@@ -71,7 +70,7 @@ _contacts_of = _outside("b3GetContactPointInformation", types.void, _PLACE, _PLA
 _copy = _outside("memcpy", _PLACE, _PLACE, _PLACE, _PLACE)
 
 
-@compiled
+@numba.njit(cache=True, error_model="numpy")
 def _look(m):  # type: ignore[no-untyped-def]
     status = _submit(m.client, _begin_state(m.client, m.body))
     answer = m.answer.ctypes.data
@@ -88,7 +87,7 @@ def _look(m):  # type: ignore[no-untyped-def]
     return True
 
 
-@compiled
+@numba.njit(cache=True, error_model="numpy")
 def run(memory, law, peak, torques):  # type: ignore[no-untyped-def]
     """As many physics steps as ``torques`` (n, 12) N·m has rows, which are filled with what the motors exerted.
 
@@ -123,13 +122,13 @@ def run(memory, law, peak, torques):  # type: ignore[no-untyped-def]
     return True
 
 
-@compiled
+@numba.njit(cache=True, error_model="numpy")
 def look(memory):  # type: ignore[no-untyped-def]
     """Fill ``raw`` of the ``RUN_DTYPE`` in ``memory``, all but the torques. Returns whether the engine answered."""
     return _look(memory.view(RUN_DTYPE)[0])
 
 
-@compiled
+@numba.njit(cache=True, error_model="numpy")
 def touch(memory):  # type: ignore[no-untyped-def]
     """Fill ``touching`` of the ``RUN_DTYPE`` in ``memory``: feet that are pressed upon, then if the body touches."""
     m = memory.view(RUN_DTYPE)[0]
