@@ -31,6 +31,12 @@ DAMPING, SETTLING = 0.2, 1.0
 """N·m·s/rad at the motor, while it is pushed and while it settles."""
 _MISSES = 3
 _STOPS = 3
+_ATTEMPTS = 3
+"""How often a motor that fell silent is let go and turned anew: its replies, or this program, may have been held up."""
+
+
+class _SilentError(CommissionError):
+    """No answer to some questions in a row."""
 
 
 async def wiggle(
@@ -41,7 +47,8 @@ async def wiggle(
 ) -> float:
     """How far the motor at ``place`` turned, rad as it reports it. Opens and closes ``bus``.
 
-    Positive torque first; where that meets a stop, negative.
+    Positive torque first; where that meets a stop, negative. A motor that falls silent is stopped and begun again with,
+    a few times.
 
     Args:
         bus: back-end, closed.
@@ -56,23 +63,32 @@ async def wiggle(
     motor = _Motor(bus, _codec(motors, place[1]), place, motors)
     await bus.open(motor.receive)
     try:
-        start = await motor.ask(motor.codec.stop[0])
-        if motor.codec.enable is not None:
-            await motor.ask(motor.codec.enable[0])
-        turned = 0.0
-        for torque in (motors.wiggle_torque, -motors.wiggle_torque):
-            turned = await _push(motor, torque, start, sleep)
-            await _settle(motor, sleep)
-            if abs(turned) >= LEAST_MOTION:
-                return turned
-        raise CommissionError(
-            f"{motor.name} did not turn with {motors.wiggle_torque:g} N·m either way, the most was {turned:+.3f} rad: "
-            "is it jammed, or its leg on the ground? (motors.wiggle_torque)"
-        )
+        for _ in range(_ATTEMPTS - 1):
+            try:
+                return await _turn(motor, motors.wiggle_torque, sleep)
+            except _SilentError:
+                await motor.stop()
+                await sleep(SETTLE_TIME)
+        return await _turn(motor, motors.wiggle_torque, sleep)
     finally:
-        for _ in range(_STOPS):
-            await bus.cycle([motor.frame(motor.codec.stop[0])], motor.reply_time)
+        await motor.stop()
         await bus.close()
+
+
+async def _turn(motor: _Motor, most: float, sleep: Callable[[float], Awaitable[None]]) -> float:
+    start = await motor.ask(motor.codec.stop[0])
+    if motor.codec.enable is not None:
+        await motor.ask(motor.codec.enable[0])
+    turned = 0.0
+    for torque in (most, -most):
+        turned = await _push(motor, torque, start, sleep)
+        await _settle(motor, sleep)
+        if abs(turned) >= LEAST_MOTION:
+            return turned
+    raise CommissionError(
+        f"{motor.name} did not turn with {most:g} N·m either way, the most was {turned:+.3f} rad: "
+        "is it jammed, or its leg on the ground? (motors.wiggle_torque)"
+    )
 
 
 async def _push(motor: _Motor, torque: float, start: float, sleep: Callable[[float], Awaitable[None]]) -> float:
@@ -130,6 +146,11 @@ class _Motor:
             return False
         return True
 
+    async def stop(self) -> None:
+        """Take its torque away, whether it answers or not."""
+        for _ in range(_STOPS):
+            await self._bus.cycle([self.frame(self.codec.stop[0])], self.reply_time)
+
     async def push(self, torque: float, damping: float) -> float:
         """Torque, N·m, and damping, N·m·s/rad, from now on; the angle, rad. Errors as ``ask``."""
         (frame,) = self.codec.encode(np.array([[0.0, 0.0, torque, 0.0, damping]]))
@@ -139,7 +160,8 @@ class _Motor:
         """Send, and the angle, rad, that comes back.
 
         Raises:
-            CommissionError: no answer to some tries, or a fault.
+            _SilentError: no answer to some tries.
+            CommissionError: a fault.
         """
         for _ in range(_MISSES):
             self._reading = None
@@ -148,7 +170,7 @@ class _Motor:
             if reading is not None:
                 break
         else:
-            raise CommissionError(f"{self.name} does not answer any more: supply, cable?")
+            raise _SilentError(f"{self.name} does not answer any more: supply, cable?")
         (si,) = self.codec.to_si(np.array([reading]))
         mode, code = int(reading[0]), int(reading[6])
         if mode not in (self.codec.running, *self.codec.starting):

@@ -220,6 +220,24 @@ def test_a_wiggle_turns_no_further_than_it_must(tmp_path):
     assert ENOUGH <= abs(operator.wiggle(place)) < 2 * ENOUGH
 
 
+def test_a_motor_that_falls_silent_for_a_while_is_let_go_and_turned_anew(tmp_path):
+    operator = Operator(7)
+    operator.do(Task("watch", ""))
+    servo, answer = operator.twin.servos[8], operator.bus._answer
+    asked = 0
+
+    def falls_silent(frame):
+        nonlocal asked
+        asked += 1
+        servo.silent = 20 <= asked < 23
+        return answer(frame)
+
+    operator.bus._answer = falls_silent
+    assert ENOUGH <= abs(operator.wiggle((int(operator.build.bus[2, 2]), int(operator.build.id[2, 2])))) < 2 * ENOUGH
+    assert asked > 23
+    assert {servo.mode for servo in operator.twin.servos} == {0}
+
+
 def test_nonsense_for_an_answer_is_asked_again_and_then_given_up(tmp_path):
     operator = Operator(8)
     answers = iter(["FL knee", "left leg +", "FL elbow +"])

@@ -23,6 +23,9 @@ from trotd.wire import MEETING, calibration_file, own_wires, twin_folder
 
 PATIENCE = 600.0
 """s, of a computer that does many other things."""
+RUNS = 5
+"""Runs that may be needed, each going on where the last one ended: a busy computer may keep a motor's replies, or its
+twin's time, for longer than any motor may be silent."""
 pytestmark = pytest.mark.timeout(1200)
 
 
@@ -105,7 +108,10 @@ def test_a_scrambled_robot_is_understood_over_its_wires_even_if_interrupted(tmp_
 def test_mit_motors_wiggle_and_are_understood_over_their_wires(tmp_path: Path) -> None:
     shell = Shell("mini_cheetah", tmp_path)
     with shell.twin(3):
-        done = shell.commission("--rehearse", "--wiggle", "--jig", "0,0.9,-1.8")
+        for _ in range(RUNS):
+            done = shell.commission("--rehearse", "--wiggle", "--jig", "0,0.9,-1.8")
+            if done.returncode == 0:
+                break
         assert done.returncode == 0, done.stderr
         assert_true(shell.found(), shell.truth(3), zero=0.02)
         _, rows = shell.check()
