@@ -86,9 +86,10 @@ class TwinBody:
         self._sense(self.measurement)
 
     def step(self) -> Measurement:
-        """Let the world live for one of its periods under what the servos do."""
+        """Let the world live for one of its periods under what the servos do; what they and the IMU feel after it."""
         now = self.clock()
-        self.measurement = self.world.step(self._command([servo.step(now) for servo in self.servos]))
+        self.world.step(self._command([servo.step(now) for servo in self.servos]))
+        self.measurement = self.world.measurement
         self._sense(self.measurement)
         return self.measurement
 

@@ -94,6 +94,11 @@ class World:
         return self._ticks * self.period
 
     @property
+    def measurement(self) -> Measurement:
+        """What the sensors read now, after the last step: what the next ``step`` will return."""
+        return self._measurement
+
+    @property
     def model(self) -> Model:
         """The rigid bodies, without payload."""
         return self._model

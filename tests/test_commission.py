@@ -71,7 +71,6 @@ class Operator:
         for _ in range(max(1, round(seconds * RATE_HZ))):
             self.now += 1 / RATE_HZ
             self.twin.step()
-        self.twin._sense(self.world._sense())
 
     def motors(self) -> dict[tuple[int, int], float]:
         ids = sorted({int(i) for i in self.build.id.ravel()})
@@ -93,7 +92,7 @@ class Operator:
 
     def force(self) -> np.ndarray:
         imu = LockstepImu((1.0, 0.0, 0.0, 0.0))
-        imu.take(1.0, self.twin.felt(self.world._sense().imu))
+        imu.take(1.0, self.twin.felt(self.twin.measurement.imu))
         return imu.latest().linear_acceleration
 
     def commission(self, path: Path, **choices: object) -> Commission:
