@@ -8,6 +8,7 @@ Only stance legs are variables, so the problem has 3, 6, 9 or 12 of them::
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -145,6 +146,32 @@ def _slope(hessian, gradient, force, row):  # type: ignore[no-untyped-def]
     for k in range(len(force)):
         total += hessian[row, k] * force[k]
     return total
+
+
+@compiled
+def free_minimum(hessian, gradient, friction, min_force, max_force, force):  # type: ignore[no-untyped-def]
+    """Write the minimum without any constraint into ``force`` (3n,). Returns whether it is accepted all the same."""
+    n = len(force)
+    root = np.empty((12, 12))  # lower triangle of the Cholesky factor
+    for i in range(n):
+        left = -gradient[i]
+        for j in range(i + 1):
+            total = hessian[i, j]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            if j < i:
+                root[i, j] = total / root[j, j]
+                left -= root[i, j] * force[j]
+            elif total > 0.0:
+                root[i, i] = math.sqrt(total)
+            else:
+                return False
+        force[i] = left / root[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            force[i] -= root[k, i] * force[k]
+        force[i] /= root[i, i]
+    return accept(hessian, gradient, friction, min_force, max_force, force)
 
 
 @compiled

@@ -18,6 +18,7 @@ from runtime.control.grf import (
     accept,
     clipped_least_squares,
     force_bounds,
+    free_minimum,
     pyramid,
     well_posed,
 )
@@ -32,7 +33,10 @@ class GrfSolver(Protocol):
 
 
 class DaqpSolver:
-    """DAQP, a dual active-set method, with a persistent workspace for each number of legs."""
+    """DAQP, a dual active-set method, with a persistent workspace for each number of legs.
+
+    Nine of ten ticks touch no constraint: then the answer is one Cholesky factorisation away, and DAQP is not asked.
+    """
 
     def __init__(self) -> None:
         import daqp
@@ -43,6 +47,11 @@ class DaqpSolver:
     def solve(self, problem: GrfProblem) -> Array | None:
         """See ``GrfSolver``. ``sense`` is cleared each time, so the result is a pure function of the problem."""
         n = len(problem.gradient)
+        free = np.empty(n)
+        if free_minimum(*problem, free):
+            return free
+        if not problem.min_force <= problem.max_force:  # nothing to find, and a workspace to lose
+            return None
         known = self._models.pop(n, None)  # put back on success alone: whatever went wrong may have left it broken
         if known is None or (known[0] is not problem and known[0][2:] != problem[2:]):
             known = (problem, self._setup(problem), np.zeros(n + PYRAMID_ROWS * n // 3, np.int32))
