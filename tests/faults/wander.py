@@ -13,6 +13,7 @@ from drivers.robot import motor_torque
 from faults.rig import Rig
 from faults.watch import COMMAND_FIELDS
 from runtime.messages.mode import Mode, Request
+from sim.sensing import VELOCITY
 
 LINEAR, YAW_RATE = ((-0.4, 0.8), (-0.3, 0.3)), 0.8
 """m/s forward and sideways, rad/s: what is asked for, at most one of them whole at a time."""
@@ -91,7 +92,7 @@ class Wanderer:
         share = dice.uniform(-1.0, 1.0, 3)
         share /= max(1.0, np.abs(share).sum())
         linear = [high * s if s > 0 else -low * s for s, (low, high) in zip(share, LINEAR, strict=False)]
-        rig.velocity = (round(linear[0], 3), round(linear[1], 3), round(YAW_RATE * float(share[2]), 3))
+        rig.velocity = (round(float(linear[0]), 3), round(float(linear[1]), 3), round(YAW_RATE * float(share[2]), 3))
         result.commands += 1
         self.lately.append(f"{rig.now:.2f} s command {rig.velocity}")
 
@@ -99,7 +100,7 @@ class Wanderer:
         rig = self.rig
         if rig.mode is Mode.WALK:
             rig.ask(Request.STAND)
-        rig.velocity = None
+        rig.velocity = (0.0, 0.0, 0.0)
         self._until(lambda: bool(rig.cycle.tick["stance"][0].all()), 3.0)
         for _ in range(200):  # all four feet down, as the operator would wait for
             if rig.mode is Mode.STAND and rig.cycle.request(Request.SIT, rig.last)[0].accepted:
@@ -119,6 +120,8 @@ class Wanderer:
     def _recover(self) -> None:
         """It damped and did not fall: say why, and go on."""
         self.faults[self.rig.cycle.state.fault.name] += 1
+        self.lately.append(f"{self.rig.now:.2f} s {self.rig.cycle.evidence}")
+        self.rig.velocity = (0.0, 0.0, 0.0)
         self._until(lambda: False, 2.0)
         self.rig.ask(Request.CLEAR)
         self._rise()
@@ -149,7 +152,7 @@ class Wanderer:
             foreseen = np.abs(motor_torque(command, rig.measurement.joints))
             result.torque = max(result.torque, float(foreseen.max()))
             result.over_limit += bool((foreseen > self._peak).any())
-        velocity = rig.world.trunk.linear_velocity
+        velocity = rig.world.body[VELOCITY]
         result.distance += math.hypot(velocity[0], velocity[1]) * rig.period
         if rig.mode in (Mode.WALK, Mode.STAND) and rig.world.fallen():
             self.lately.append(f"{rig.now:.2f} s fell in {rig.mode.name}")
