@@ -51,10 +51,11 @@ check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	MYPYPATH=tests $(BIN)/mypy tests/soak.py tests/torture.py tests/fuzz.py tests/mutation.py tests/faults
 	$(BIN)/lint-imports --no-cache
 
 failsafe: $(VENV)/.dev
-	@$(BIN)/python -m runtime.failsafe > docs/failsafe.md
+	@$(BIN)/python -m runtime.failsafe docs/torture.json > docs/failsafe.md
 
 mutation: $(VENV)/.dev
 	@$(BIN)/python tests/mutation.py

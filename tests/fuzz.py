@@ -25,8 +25,10 @@ LARGEST_GROWTH = 4.0
 """MiB of resident memory, after a twentieth of the inputs to settle."""
 KEPT_FAILURES = 5
 INTERESTING = (b"\x00", b"\xff", b"\x7f", b"\x80", b"\xfa\xff", b"\x50", b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f")
-TOKENS = (b"NaN", b"1e999", b"-1", b"0", b"18446744073709551616", b"null", b"true", b'""', b"[]", b"{}", b'"\\ud800"')
-TOKENS += (b"1e-400", b"inf", b"nan", b"''", b"-0.0", b"[[", b"}", b"\xc3\x28", b"1979-05-27")
+TOKENS = (
+    *(b"NaN", b"1e999", b"-1", b"0", b"18446744073709551616", b"null", b"true", b'""', b"[]", b"{}", b'"\\ud800"'),
+    *(b"1e-400", b"inf", b"nan", b"''", b"-0.0", b"[[", b"}", b"\xc3\x28", b"1979-05-27"),
+)
 
 
 @dataclass(frozen=True, slots=True)

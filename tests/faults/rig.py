@@ -69,7 +69,9 @@ class Body(Protocol):
     """What the rig wants of a body."""
 
     world: World
-    now: float
+
+    @property
+    def now(self) -> float: ...
 
     def exchange(self, command: JointCommand) -> Measurement: ...
 
