@@ -1,13 +1,15 @@
 """What can go wrong, who notices, what the daemon does, how soon, and the test that proves it: one table.
 
-``python -m runtime.failsafe`` prints ``docs/failsafe.md``; ``make failsafe`` writes it.
+``python -m runtime.failsafe docs/torture.json`` prints ``docs/failsafe.md``; ``make failsafe`` writes it.
 """
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
+from runtime.failsafe_figures import figures
 from runtime.modes import SEATED, WHOLE, WORDS, Reason
 
 LIMITS, PLAUSIBILITY, CYCLE = "tests/test_limits.py", "tests/test_plausibility.py", "tests/test_cycle.py"
@@ -321,15 +323,15 @@ and "stops" of a fault into "damps". A fault stays, with its evidence, until `tr
 """
 
 
-def document() -> str:
-    """The table as Markdown."""
+def document(measured: Path) -> str:
+    """The table as Markdown, and behind it what torture wrote to the file ``measured``."""
     rows = []
     for row in TABLE:
         named = "" if row.reason is None else WORDS[row.reason]
         judged = f"`{row.judged}`" if "." in row.judged and " " not in row.judged else row.judged
         rows.append(f"| {row.fault} | {named} | {judged} | {row.answer} | {row.ticks} | `{row.test}` |\n")
-    return HEAD + "".join(rows)
+    return HEAD + "".join(rows) + figures(measured)
 
 
 if __name__ == "__main__":
-    sys.stdout.write(document())
+    sys.stdout.write(document(Path(sys.argv[1])))
