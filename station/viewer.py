@@ -31,6 +31,9 @@ DRAW_SECONDS = 0.05
 SILENCE_SECONDS = 5.0
 CHUNK = 2000
 """Ticks of a recording drawn at a time."""
+UNTAKEN = 500_000_000
+"""Bytes that may wait for a viewer that does not take them."""
+UNITS = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +45,21 @@ class Screen:
     web_port: int = 9090
     grpc_port: int = 9876
     memory: str = "1GiB"
-    """The viewer's bound; its oldest data go first."""
+    """The viewer's bound; its oldest data go first. A browser's lie in this process, a window's in its own."""
+
+    def __post_init__(self) -> None:
+        """Raises StationError for a ``memory`` that is no number and unit."""
+        _ = self.kept
+
+    @property
+    def kept(self) -> int:
+        """Bytes that this process may keep for whoever looks at it later."""
+        unit = self.memory.lstrip("0123456789.")
+        try:
+            size = float(self.memory.removesuffix(unit)) * UNITS[unit]
+        except (ValueError, KeyError) as error:
+            raise StationError(f"memory {self.memory!r}: a number and one of {', '.join(UNITS)}") from error
+        return round(size) if self.web else 0
 
     @property
     def address(self) -> str:
@@ -50,8 +67,10 @@ class Screen:
         data = quote(f"rerun+http://127.0.0.1:{self.grpc_port}/proxy", safe="")
         return f"http://127.0.0.1:{self.web_port}/?url={data}"
 
-    def open(self, name: str) -> rr.RecordingStream:
+    def open(self, name: str, endless: bool = False) -> rr.RecordingStream:
         """A stream that ends on this screen, laid out for a robot. A browser is served for as long as it is kept.
+
+        A file's table of contents is kept in memory until its end, some 18 MB a minute: an ``endless`` one has none.
 
         Raises:
             StationError: the file cannot be written, or there is no viewer to start.
@@ -61,7 +80,7 @@ class Screen:
         blueprint = build_blueprint()
         try:
             if self.save is not None:
-                stream.save(self.save, default_blueprint=blueprint)
+                stream.save(self.save, default_blueprint=blueprint, write_footer=not endless)
             elif self.web:
                 url = stream.serve_grpc(
                     grpc_port=self.grpc_port, default_blueprint=blueprint, server_memory_limit=self.memory
@@ -114,8 +133,8 @@ def view_live(
         StationError: the robot does not answer, runs another version, or the screen no longer takes anything.
     """
     with TickStream(station) as ticks:
-        canvas = Canvas(screen.open(station.robot), description)
-        bound = MemoryBound()
+        canvas = Canvas(screen.open(station.robot, endless=True), description)
+        bound = MemoryBound(screen.kept + UNTAKEN)
         heard = time.monotonic()
         while more():
             time.sleep(DRAW_SECONDS)
@@ -142,8 +161,9 @@ def _find_viewer() -> str | None:
 class MemoryBound:
     """Ends a process whose screen has stopped taking: what it would buffer has a bound."""
 
-    def __init__(self, megabytes: int = 500) -> None:
-        self._bound = _resident() + megabytes * 1_000_000
+    def __init__(self, more: int) -> None:
+        """``more`` bytes than now."""
+        self._bound = _resident() + more
 
     def check(self) -> None:
         """Raise StationError beyond the bound."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import mmap
 import signal
 import socket
 import subprocess
@@ -25,7 +26,7 @@ from station import ticks as station_ticks
 from station.canvas import SCENE_HZ, Canvas
 from station.pose import heading_to_world, leg_points, orientation_xyzw
 from station.session import StationError, free_endpoint
-from station.viewer import Screen, view_recording
+from station.viewer import MemoryBound, Screen, view_recording
 
 rr = pytest.importorskip("rerun")
 
@@ -126,6 +127,27 @@ def test_a_recording_of_another_layout_is_refused_by_the_field_s_name(walked: Wa
     path = walked.recorder.write(other, "other")
     with pytest.raises(StationError, match="no field 'grf'"):
         view_recording(path, Screen(save=tmp_path / "x.rrd"))
+
+
+def test_a_browser_s_data_may_lie_in_this_process_and_a_window_s_may_not() -> None:
+    assert Screen(web=True, memory="1.5GiB").kept == 3 * 2**29
+    assert Screen(web=True, memory="200MB").kept == 200_000_000
+    assert Screen(memory="1GiB").kept == 0
+
+
+@pytest.mark.parametrize("memory", ["much", "1", "GiB", "1.2.3GB", "-1GiB", "1 TB", ""])
+def test_a_memory_without_number_or_unit_is_refused(memory: str) -> None:
+    with pytest.raises(StationError, match="a number and one of kB, MB, GB"):
+        Screen(memory=memory)
+
+
+def test_memory_that_grows_past_its_bound_ends_the_viewer() -> None:
+    bound = MemoryBound(30_000_000)
+    bound.check()
+    with mmap.mmap(-1, 40_000_000) as block:
+        block.write(b"x" * len(block))
+        with pytest.raises(StationError, match="the viewer does not take what it is sent"):
+            bound.check()
 
 
 def test_what_is_no_recording_is_refused(tmp_path) -> None:  # type: ignore[no-untyped-def]

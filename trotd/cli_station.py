@@ -68,11 +68,11 @@ def view(
     from station import viewer
     from station.session import connected
 
-    screen = viewer.Screen(save=save, web=web, web_port=web_port, grpc_port=port, memory=memory)
     end = time.monotonic() + seconds if seconds > 0 else float("inf")
-    if web:
-        typer.echo(f"viewer: {screen.address}  (Ctrl-C ends it)", err=True)
     with refusals():
+        screen = viewer.Screen(save=save, web=web, web_port=web_port, grpc_port=port, memory=memory)
+        if web:
+            typer.echo(f"viewer: {screen.address}  (Ctrl-C ends it)", err=True)
         if recording is not None:
             drawn = viewer.view_recording(recording, screen)
             while web and time.monotonic() < end:
