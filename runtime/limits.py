@@ -122,7 +122,7 @@ def judge_fall(ticks, bounds, memories):  # type: ignore[no-untyped-def]
     """
     t, b, m = ticks[0], bounds[0], memories[0]
     speed = math.hypot(t.twist[0], t.twist[1])
-    if m.upright < SETTLED or not speed > 0.0:
+    if m.upright < SETTLED:
         return _OK
     x, y = t.twist[0] / speed, t.twist[1] / speed
     reach = -math.inf
@@ -134,7 +134,7 @@ def judge_fall(ticks, bounds, memories):  # type: ignore[no-untyped-def]
     tipping = (t.twist[4] * up_z - t.twist[5] * up_y) * x + (t.twist[5] * up_x - t.twist[3] * up_z) * y
     overreach = speed * math.sqrt(max(LOWEST, t.height) / GRAVITY) - reach + LEVER * (lean + AHEAD * tipping)
     bound = b.overreach[1 if t.mode == _WALK else 0]
-    if not overreach > bound:
+    if not overreach > bound:  # a robot that does not move falls no way at all: not a number
         return _OK
     m.severity = 0
     find(m, b, _FALLING, -1, overreach, bound)

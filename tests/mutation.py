@@ -24,6 +24,7 @@ ROOT = Path(__file__).parents[1]
 TESTS = {
     "runtime/limits.py": ("tests/test_limits.py", "tests/test_plausibility.py"),
     "runtime/plausibility.py": ("tests/test_plausibility.py", "tests/test_limits.py"),
+    "runtime/encoders.py": ("tests/test_encoders.py", "tests/test_plausibility.py"),
     "runtime/derating.py": ("tests/test_derating.py", "tests/test_limits.py"),
     "runtime/modes.py": ("tests/test_modes.py",),
     "runtime/arming.py": ("tests/test_arming.py",),

@@ -192,6 +192,63 @@ def test_a_negative_gain_is_refused(name: str) -> None:
     assert make_guard().bound(tick) is Reason.BAD_COMMAND
 
 
+def moving(speed: float, mode: Mode = Mode.STAND) -> Records:
+    """Sideways, m/s, over feet that stand 0.2 m beside the body's middle."""
+    tick = healthy()
+    tick["mode"], tick["height"], tick["twist"][0, 1] = mode, 0.5, speed
+    tick["feet"][0, :, 1] = (0.2, -0.2, 0.2, -0.2)
+    return tick
+
+
+def judged_moving(tick: Records, upright: float = 10.0) -> tuple[Reason, str]:
+    guard = make_guard(max_overreach=(0.3, 0.6))
+    guard.memory["upright"] = upright
+    reason = guard.judge_plan(tick)
+    return reason, guard.explain(reason) if reason.is_fault else ""
+
+
+REACH = math.sqrt(0.5 / 9.81)
+"""m of capture point for each m/s."""
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize(("mode", "bound"), [(Mode.STAND, 0.3), (Mode.WALK, 0.6)])
+def test_a_capture_point_that_no_step_reaches_is_a_fall(side: float, mode: Mode, bound: float) -> None:
+    limit = (0.2 + bound) / REACH
+    assert judged_moving(moving(side * limit * 0.99, mode)) == (Reason.OK, "")
+    reason, words = judged_moving(moving(side * limit * 1.01, mode))
+    assert reason is Reason.FALLING
+    assert f"bound {bound:g}" in words
+
+
+def test_a_robot_that_has_just_stood_up_is_not_judged_by_its_speed() -> None:
+    assert judged_moving(moving(5.0), upright=0.1)[0] is Reason.OK
+
+
+@pytest.mark.parametrize(("mode", "ticks", "falls"), [
+    (Mode.STAND, 99, False), (Mode.STAND, 110, True), (Mode.WALK, 110, True), (Mode.STAND_UP, 500, False),
+])  # fmt: skip
+def test_half_a_second_of_standing_or_walking_makes_its_speed_tell(mode: Mode, ticks: int, falls: bool) -> None:
+    guard, tick = make_guard(), moving(5.0, mode)
+    for _ in range(ticks):
+        guard.judge(tick)
+    assert (guard.judge_plan(tick) is Reason.FALLING) is falls
+
+
+def test_a_robot_that_does_not_move_does_not_fall() -> None:
+    tick = moving(0.0)
+    tick["rpy"][0, 0] = 0.8
+    assert judged_moving(tick)[0] is Reason.OK
+
+
+def test_a_lean_the_way_that_it_moves_brings_the_fall_nearer() -> None:
+    """To the right: a positive roll turns the left side up."""
+    for roll, expected in ((0.4, Reason.FALLING), (-0.4, Reason.OK)):
+        tick = moving(-0.9 * 0.5 / REACH)
+        tick["rpy"][0, 0] = roll
+        assert judged_moving(tick)[0] is expected
+
+
 @given(st.floats(0, 3.1), st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi))
 def test_tilt_does_not_depend_on_heading(angle: float, axis: float, yaw: float) -> None:
     half, turn = angle / 2, yaw / 2
