@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import pi
 
@@ -11,11 +11,12 @@ import numpy as np
 
 from runtime import policies
 from runtime.config import Config
-from runtime.control.policy import Policy
+from runtime.control.policy import Policy, encode_policy
 from sim.scenario import Push, Scenario
-from training.checkpoint import RunFolder
+from training.checkpoint import RunFolder, write_whole
 from training.contest import Contender, Contest, Outcome, Trial
 from training.randomize import SENSORS, TASK, Conditions, draw
+from training.variants import with_parameters
 
 CANDIDATES = 4
 """Checkpoints that are compared: the last ones, evenly spread over the last stage."""
@@ -28,6 +29,8 @@ class Verdict:
     """A candidate on the validation set."""
 
     iteration: int
+    averaged: int
+    """Checkpoints up to this one that its numbers are the mean of; 1: it is that checkpoint."""
     falls: int
     error: float
     """Mean velocity error over the grid, m/s."""
@@ -62,7 +65,7 @@ def validation_set(draws: int = 24) -> tuple[list[Trial], list[Trial]]:
     return measured, pushed + [Trial(draw(TASK, rng), 2.6) for _ in range(draws)]
 
 
-def judge(contest: Contest, who: Contender, iteration: int) -> Verdict:
+def judge(contest: Contest, who: Contender, iteration: int, averaged: int = 1) -> Verdict:
     """One candidate."""
     measured, survived = validation_set()
     walks = contest.play(who, measured)
@@ -71,6 +74,7 @@ def judge(contest: Contest, who: Contender, iteration: int) -> Verdict:
     errors = np.abs(np.array([outcome.velocity for outcome in walks]) - wanted)[:, :2]
     return Verdict(
         iteration=iteration,
+        averaged=averaged,
         falls=sum(outcome.fell for outcome in [*walks, *rest]),
         error=float(errors.mean()),
         task_return=float(np.mean([outcome.task_return for outcome in rest])),
@@ -78,18 +82,32 @@ def judge(contest: Contest, who: Contender, iteration: int) -> Verdict:
 
 
 def select(config: Config, folder: RunFolder, workers: int, say: Callable[[str], None]) -> Policy:
-    """The best of the last stage's checkpoints, with the verdicts in its provenance."""
+    """The best of the last stage's checkpoints and their mean, with the verdicts in its provenance."""
     numbers = folder.iterations()
     last_stage = [row.iteration for row in folder.curve() if row.stage == folder.curve()[-1].stage]
     last = [number for number in numbers if number in last_stage] or numbers
     chosen = sorted({last[round(k)] for k in np.linspace(len(last) // 3, len(last) - 1, CANDIDATES)})
-    verdicts = []
+    robot = config.robot.name
+    candidates = {(number, 1): policies.load(folder.policy_file(number), robot) for number in chosen}
+    half = last[len(last) // 2 :]
+    candidates[half[-1], len(half)] = mean_of([policies.load(folder.policy_file(number), robot) for number in half])
+    verdicts: dict[tuple[int, int], Verdict] = {}
     with Contest(config, workers) as contest:
-        for number in chosen:
-            who = Contender(f"{number}", "policy", str(folder.policy_file(number)))
-            verdicts.append(judge(contest, who, number))
-            say(f"validation of {number}: {msgspec.to_builtins(verdicts[-1])}, score {verdicts[-1].score:.0f}")
-    best = max(verdicts, key=lambda verdict: verdict.score)
-    policy = policies.load(folder.policy_file(best.iteration), config.robot.name)
-    results = [msgspec.to_builtins(verdict) for verdict in verdicts]
-    return msgspec.structs.replace(policy, provenance=policy.provenance | {"validation": results})
+        for (number, averaged), policy in candidates.items():
+            path = folder.policy_file(number)
+            if averaged > 1:
+                path = folder.path / "mean.json"
+                write_whole(path, encode_policy(policy))
+            verdict = judge(contest, Contender(f"{number} {averaged}", "policy", str(path)), number, averaged)
+            say(f"validation of {number}: {msgspec.to_builtins(verdict)}, score {verdict.score:.0f}")
+            verdicts[number, averaged] = verdict
+    best = candidates[max(verdicts, key=lambda key: verdicts[key].score)]
+    results = [msgspec.to_builtins(verdict) for verdict in verdicts.values()]
+    return msgspec.structs.replace(best, provenance=best.provenance | {"validation": results})
+
+
+def mean_of(members: Sequence[Policy]) -> Policy:
+    """The mean of several checkpoints of one run: a stage's random walk around its optimum averages out."""
+    mean = np.mean([member.parameters for member in members], axis=0)
+    last = with_parameters(members[-1], mean)
+    return msgspec.structs.replace(last, provenance=last.provenance | {"averaged": len(members)})

@@ -1,0 +1,85 @@
+"""Which of a run's policies is kept, with a contest that knows the best numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.robot import Array
+from runtime import config as configuration
+from runtime import policies
+from runtime.control.policy import encode_policy
+from training import pgpe, selection
+from training.checkpoint import Checkpoint, Row, RunFolder
+from training.contest import Contender, Outcome, Trial
+from training.variants import VARIANTS, make_policy, with_parameters
+
+CONFIG = configuration.load(configuration.find_robot("stoch3"))
+BEST: Array = 0.1 * np.sin(np.arange(504.0))
+TEMPLATE = make_policy(CONFIG.robot, CONFIG.control.gait.walking_height, VARIANTS["linear"], True, "tried")
+
+
+class NearnessContest:
+    """Stands for the simulator: a policy is as good as its numbers are near the best ones."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def __enter__(self) -> NearnessContest:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def play(self, who: Contender, trials: Sequence[Trial]) -> list[Outcome]:
+        assert who.path is not None
+        far = float(np.linalg.norm(policies.load(Path(who.path), "stoch3").parameters - BEST))
+        return [Outcome(False, 2.6, (0.0, 0.0, 0.0), 0.5, 9.0, 4.0, task_return=-far, compute=1e-4) for _ in trials]
+
+
+def run_of(path: Path, means: Sequence[Array]) -> RunFolder:
+    """A folder with one checkpoint for each mean, all of one stage."""
+    folder = RunFolder(path)
+    (path / "checkpoints").mkdir(parents=True)
+    for number, mean in enumerate(means):
+        state = pgpe.start(mean, 0.1)
+        row = Row("refine", number, 0.0, 0.0, 0.0, 1.0, 0, 1, 0.1, 1.0, {})
+        folder.save(Checkpoint(0, number, state), encode_policy(with_parameters(TEMPLATE, mean)), row)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _nearness(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selection, "Contest", NearnessContest)
+
+
+def selected(folder: RunFolder) -> tuple[Array, dict[str, object]]:
+    policy = selection.select(CONFIG, folder, 1, lambda _: None)
+    return policy.parameters, policy.provenance
+
+
+def test_means_that_wander_around_the_best_numbers_are_averaged(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    folder = run_of(tmp_path, [BEST + 0.05 * rng.standard_normal(504) for _ in range(12)])
+    parameters, provenance = selected(folder)
+    assert provenance["averaged"] == 6
+    tail = [policies.load(folder.policy_file(number), "stoch3").parameters for number in range(6, 12)]
+    assert parameters == pytest.approx(np.mean(tail, axis=0), abs=1e-12)
+    verdicts = provenance["validation"]
+    assert isinstance(verdicts, list)
+    assert [verdict["averaged"] for verdict in verdicts] == [1, 1, 1, 1, 6]
+
+
+def test_one_checkpoint_that_is_better_than_the_mean_is_kept(tmp_path: Path) -> None:
+    folder = run_of(tmp_path, [(1 + (11 - number)) * BEST for number in range(12)])
+    parameters, provenance = selected(folder)
+    assert "averaged" not in provenance
+    assert parameters == pytest.approx(BEST)
+
+
+def test_a_run_of_one_checkpoint_keeps_it(tmp_path: Path) -> None:
+    parameters, _ = selected(run_of(tmp_path, [BEST]))
+    assert parameters == pytest.approx(BEST)
