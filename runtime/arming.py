@@ -17,8 +17,8 @@ from runtime.control.policy import Policy
 from runtime.control.records import Records, VelocityCommand
 from runtime.guard import Guard, joint_name, tilt
 from runtime.messages.mode import ArmingCheck, Mode
-from runtime.modes import Reason
 from runtime.parameters import ArmingConfig, LimitsConfig
+from runtime.reasons import Reason
 
 REST = 1e-3
 """m/s and rad/s: a smaller command is none."""

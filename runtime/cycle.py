@@ -22,7 +22,8 @@ from runtime.guard import Guard
 from runtime.messages.event import Event
 from runtime.messages.fault import Evidence
 from runtime.messages.mode import ArmingCheck, Mode, Request
-from runtime.modes import Answer, ModeState, Reaction, Reason
+from runtime.modes import Answer, ModeState
+from runtime.reasons import Reaction, Reason
 from runtime.sources import Sources
 from runtime.tick_record import TickRecord, Wake
 

@@ -35,7 +35,7 @@ from runtime.messages.motion import PoseMessage
 from runtime.messages.policy import PolicyEntry
 from runtime.messages.status import Status
 from runtime.messages.tuning import TuningEntry, TuningReply, TuningRequest
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from runtime.shelf import PolicyFile, Shelf
 from runtime.status import build_status
 from runtime.stopping import damp, stopped_by_signals

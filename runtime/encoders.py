@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from runtime.control.compilation import compiled
 from runtime.messages.mode import Mode
-from runtime.modes import Reason
 from runtime.plausibility import PROMPT
+from runtime.reasons import Reason
 from runtime.verdict import find
 
 _DAMP, _STAND, _WALK = int(Mode.DAMP), int(Mode.STAND), int(Mode.WALK)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from runtime.failsafe_figures import figures
-from runtime.modes import SEATED, WHOLE, WORDS, Reason
+from runtime.reasons import SEATED, WHOLE, WORDS, Reason
 
 LIMITS, PLAUSIBILITY, CYCLE = "tests/test_limits.py", "tests/test_plausibility.py", "tests/test_cycle.py"
 ENCODERS, DEGRADE = "tests/test_encoders.py", "tests/test_degrade.py"

@@ -16,9 +16,9 @@ from runtime.encoders import look_at_encoder
 from runtime.limits import bound_command, judge_body, judge_fall, judge_joint, judge_load, judge_policy
 from runtime.messages.fault import Evidence
 from runtime.messages.tick import TICK_DTYPE
-from runtime.modes import Reaction, Reason, reaction
 from runtime.parameters import DegradeConfig, LimitsConfig
 from runtime.plausibility import keep_time, look_at_imu, look_at_joint, look_at_motor
+from runtime.reasons import Reaction, Reason, reaction
 from runtime.verdict import BOUNDS_DTYPE, MEMORY_DTYPE
 
 NOISE_TIME = 0.1

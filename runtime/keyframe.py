@@ -12,7 +12,8 @@ from runtime.control.records import Records, VelocityCommand
 from runtime.control.state import STATE_DTYPE
 from runtime.messages.mode import Mode
 from runtime.messages.tick import TUNED
-from runtime.modes import ModeState, Reason
+from runtime.modes import ModeState
+from runtime.reasons import Reason
 from runtime.sources import COMMAND_FIELDS
 from runtime.verdict import MEMORY_DTYPE
 

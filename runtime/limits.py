@@ -12,7 +12,7 @@ from runtime.control.compilation import compiled
 from runtime.control.kinematics import GRAVITY
 from runtime.control.records import Clamp
 from runtime.messages.mode import Mode
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from runtime.verdict import find
 
 _OK, _NOT_FINITE, _STALE_MOTOR, _TILTED, _MOTOR_FAULT, _HOT = (

@@ -7,7 +7,7 @@ import math
 from runtime.control.compilation import compiled
 from runtime.control.kinematics import GRAVITY
 from runtime.control.records import Clamp
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from runtime.verdict import find
 
 _OK, _STALE_IMU, _IMPLAUSIBLE, _FROZEN, _JUMP, _TURN, _GRAVITY = (

@@ -21,7 +21,7 @@ from runtime.cycle import Cycle
 from runtime.keyframe import KEYFRAME_DTYPE
 from runtime.messages.mode import Mode, Request
 from runtime.messages.tick import TICK_DTYPE, TUNED
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from runtime.recording import Recording, RecordingError
 from runtime.tick_record import Wake
 

@@ -10,7 +10,7 @@ from drivers.robot import Array
 from runtime.control.records import Clamp, SolverStatus
 from runtime.cycle import Cycle
 from runtime.messages.status import Status
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from runtime.shelf import PolicyFile
 
 

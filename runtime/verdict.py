@@ -10,11 +10,11 @@ import numpy as np
 from runtime.control.compilation import compiled
 
 REASONS = 128
-"""Room for the numbers of ``runtime.modes.Reason``."""
+"""Room for the numbers of ``runtime.reasons.Reason``."""
 
 BOUNDS_DTYPE = np.dtype(
     [
-        ("reaction", "u1", (REASONS,)),  # runtime.modes.Reaction to each Reason
+        ("reaction", "u1", (REASONS,)),  # runtime.reasons.Reaction to each Reason
         ("period", "f8"),
         ("cos_tilt", "f8"),
         ("age", "f8"),

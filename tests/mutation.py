@@ -27,6 +27,7 @@ TESTS = {
     "runtime/encoders.py": ("tests/test_encoders.py", "tests/test_plausibility.py"),
     "runtime/derating.py": ("tests/test_derating.py", "tests/test_limits.py"),
     "runtime/modes.py": ("tests/test_modes.py",),
+    "runtime/reasons.py": ("tests/test_modes.py", "tests/test_cycle.py"),
     "runtime/arming.py": ("tests/test_arming.py",),
 }
 """Modules that hold guards, and the tests that must notice, quickest first."""

@@ -14,7 +14,7 @@ from drivers.robot import JointCommand, Measurement, damp_command
 from runtime.control.records import Clamp, VelocityCommand
 from runtime.cycle import Cycle
 from runtime.messages.mode import Mode, Request
-from runtime.modes import Reason
+from runtime.reasons import Reason
 
 
 class Bench:

@@ -13,7 +13,7 @@ from drivers.robot import Measurement
 from runtime.control.records import Clamp, VelocityCommand
 from runtime.cycle import Cycle
 from runtime.messages.mode import Mode, Request
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from sim.scenario import Scenario
 
 Change = Callable[[Measurement, int], Measurement]

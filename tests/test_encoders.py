@@ -9,7 +9,7 @@ from test_plausibility import PERIOD, Change, Stream
 
 from runtime.control.records import Records
 from runtime.messages.mode import Mode
-from runtime.modes import Reason
+from runtime.reasons import Reason
 
 
 def test_an_encoder_that_stands_still_while_its_leg_moves_is_found() -> None:

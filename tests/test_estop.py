@@ -11,7 +11,7 @@ from daemons import Probe, is_damp, make_config, make_policy, wake
 from drivers.robot import damp_command
 from runtime.cycle import Cycle
 from runtime.messages.mode import Mode, Request
-from runtime.modes import Reason
+from runtime.reasons import Reason
 
 WAYS: dict[str, list[Request | Mode | int]] = {
     "up, walk and down": [

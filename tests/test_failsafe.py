@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from runtime.failsafe import TABLE, document
-from runtime.modes import Reason
+from runtime.reasons import Reason
 
 ROOT = Path(__file__).parents[1]
 ELSEWHERE = {Reason.UNREACHABLE}

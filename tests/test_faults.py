@@ -15,7 +15,7 @@ from runtime.cycle import Fault
 from runtime.faults import KEPT, VERSION, FaultFileError, FaultHistory, fault_file, load_faults
 from runtime.messages.fault import Evidence, FaultRecord
 from runtime.messages.mode import Mode, Request
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from station.session import Station
 
 

@@ -17,8 +17,8 @@ from runtime.control.records import Clamp, Records
 from runtime.guard import Guard, tilt
 from runtime.messages.mode import Mode
 from runtime.messages.tick import TICK_DTYPE
-from runtime.modes import Reason
 from runtime.parameters import LimitsConfig
+from runtime.reasons import Reason
 
 CONFIG = make_config()
 PEAK = np.array(CONFIG.robot.joints.peak_torque)

@@ -12,7 +12,7 @@ from drivers.robot import LEGS
 from runtime.control.records import Clamp
 from runtime.cycle import Cycle
 from runtime.messages.mode import Mode, Request
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from sim.scenario import Scenario
 from sim.terrain import HeightField
 from sim.twin import REAL_NOISE

@@ -7,7 +7,8 @@ from itertools import product
 import pytest
 
 from runtime.messages.mode import Mode, Request
-from runtime.modes import TABLE, WORDS, ModeState, Reason, advance, request
+from runtime.modes import TABLE, ModeState, advance, request
+from runtime.reasons import WORDS, Reason
 
 FAULTS = [reason for reason in Reason if reason.is_fault]
 STATES = [

@@ -13,7 +13,7 @@ from drivers.robot import LEGS
 from runtime.control.records import Clamp, Records
 from runtime.guard import Guard
 from runtime.messages.mode import Mode
-from runtime.modes import Reason
+from runtime.reasons import Reason
 
 PERIOD = 0.005
 Change = Callable[[Records, int], None]

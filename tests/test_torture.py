@@ -19,7 +19,7 @@ from faults.run import Case, replay
 from faults.watch import Outcome, Watch
 
 from drivers.robot import JointCommand
-from runtime.modes import Reason
+from runtime.reasons import Reason
 
 TORTURE = Path(__file__).parent / "torture.py"
 SAMPLE = 200

@@ -13,7 +13,7 @@ from drivers.errors import DriverError
 from drivers.robot import JOINTS, LEGS
 from runtime import config
 from runtime.messages.mode import Mode, Request
-from runtime.modes import Reason
+from runtime.reasons import Reason
 from sim.build import Build, build_of, lab_build, scrambled
 from sim.mit_emulator import MitEmulator
 from trotd.lockstep import TwinWalk

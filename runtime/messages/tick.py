@@ -19,7 +19,7 @@ TICK_DTYPE = np.dtype(
         ("overruns", "u4"),  # deadlines missed since the daemon started
         ("mode", "u1"),  # Mode
         ("armed", "u1"),
-        ("reason", "u2"),  # why the mode is what it is (runtime.modes.Reason)
+        ("reason", "u2"),  # why the mode is what it is (runtime.reasons.Reason)
         ("policy", "u4"),  # generation of the active policy, counted from 1 at start
         ("outgoing", "u4"),  # generation of the policy that it is blended in over, while its share is below one
         *TUNED_FIELDS,  # what the operator may change, as in force in this tick
