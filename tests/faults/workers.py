@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
+import queue
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+LOOK = 5.0
+"""s between two looks at whether the workers still live."""
+_PR_SET_PDEATHSIG = 1
 
 
 def spread(items: Iterable[Item], act: Callable[[Item, Callable[[Result], None]], None], jobs: int) -> Iterator[Result]:
-    """``act(item, tell)`` for every item, in ``jobs`` processes; what they tell, in the order of its arrival."""
+    """``act(item, tell)`` for every item, in ``jobs`` processes; what they tell, in the order of its arrival.
+
+    Raises:
+        RuntimeError: a process was killed; what it was at is lost.
+    """
     context = multiprocessing.get_context("spawn")
     waiting, results = context.Queue(), context.Queue()
     for item in items:
@@ -23,7 +33,12 @@ def spread(items: Iterable[Item], act: Callable[[Item, Callable[[Result], None]]
         worker.start()
     try:
         while jobs:
-            done, result = results.get()
+            try:
+                done, result = results.get(timeout=LOOK)
+            except queue.Empty:
+                if killed := [worker.exitcode for worker in workers if worker.exitcode]:
+                    raise RuntimeError(f"a worker ended with code {killed[0]}") from None
+                continue
             if done:
                 jobs -= 1
             else:
@@ -35,6 +50,7 @@ def spread(items: Iterable[Item], act: Callable[[Item, Callable[[Result], None]]
 
 
 def _work(act: Callable[..., None], waiting: Any, results: Any) -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # with whoever wants the results, or it runs for hours
     for item in iter(waiting.get, None):
         act(item, lambda result: results.put((False, result)))
     results.put((True, None))
