@@ -1,6 +1,6 @@
 """``trotd``: the front door. One thin function a subcommand; each imports only the rooms that it needs.
 
-Exit codes: 0 done, 1 it failed, 2 bad input.
+Exit codes: 0 done, 1 it failed, 2 bad input, 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trotd import cli_bench, cli_hardware, cli_live, cli_ros2, cli_station, cli_study, cli_training
-from trotd.exits import BAD_INPUT, FAILED
+from trotd.exits import FAILED, one_line_errors
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -42,7 +42,7 @@ app = typer.Typer(
 `trotd sit`, and `trotd damp` at any moment.
 
 The daemon never moves the robot by itself: it starts in DAMP and waits to be armed.
-Exit codes: 0 done, 1 it failed, 2 bad input.""",
+Exit codes: 0 done, 1 it failed, 2 bad input, 130 Ctrl-C.""",
 )
 
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="A shipped robot's name, or a .toml file.")]
@@ -52,31 +52,6 @@ StateOption = Annotated[
     Path | None, typer.Option("--state", help="Folder of lock, kept policy and recordings.", file_okay=False)
 ]
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-
-
-@contextlib.contextmanager
-def _one_line_errors() -> Iterator[None]:
-    """Bad input ends with one line and code 2; what the robot or the link refuses with one line and code 1.
-
-    Configuration, policy and body errors are ValueErrors; one from inside the loop would come in an ExceptionGroup.
-    """
-    from drivers.errors import DriverError
-    from runtime.link import LinkError
-    from runtime.realtime import RealtimeError
-    from runtime.state import LockError
-    from station.session import StationError
-
-    try:
-        yield
-    except (ValueError, LinkError, LockError, RealtimeError, ImportError) as error:
-        _leave(error, BAD_INPUT)
-    except (DriverError, StationError, OSError) as error:
-        _leave(error, FAILED)
-
-
-def _leave(error: Exception, code: int) -> None:
-    typer.echo(f"trotd: {' '.join(str(error).split())}", err=True)
-    raise typer.Exit(code) from error
 
 
 def _load(robot: str, rate_hz: float | None, listen: list[str] | None) -> tuple[Config, Path]:
@@ -109,7 +84,7 @@ def run(
     Example: `trotd run --body sim --robot my.toml --rate-hz 500`
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
-    with _one_line_errors(), _announced() as started:
+    with one_line_errors(), _announced() as started:
         from runtime import daemon, policies
         from runtime.state import state_folder
         from trotd.bodies import build_body, lenient
@@ -188,7 +163,7 @@ def tour(
 
     Exit code 1 if it fell or missed a bound. Under 90 s.
     """
-    with _one_line_errors():
+    with one_line_errors():
         from trotd.tour import take_tour
 
         config, path = _load(robot, rate_hz, None)
@@ -202,7 +177,7 @@ def tour(
 @app.command()
 def status(robot: RobotOption = "stoch3", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
     """Print the robot's next status as JSON."""
-    with _one_line_errors():
+    with one_line_errors():
         import msgspec
 
         from station.session import connected
@@ -227,7 +202,7 @@ def _say_reply(reply: ModeReply) -> None:
 
 
 def _request(word: str, robot: str, connect: str) -> None:
-    with _one_line_errors():
+    with one_line_errors():
         reply = _ask(word, robot, connect)
         _say_reply(reply)
         if not reply.accepted:
@@ -244,7 +219,7 @@ def arm(
 
     No motor gets torque before every line is ok, and then only through a soft start. Exit code 1 if it was refused.
     """
-    with _one_line_errors():
+    with one_line_errors():
         import msgspec
 
         reply = _ask("arm", robot, connect)
@@ -268,7 +243,7 @@ def faults(
     ] = None,
 ) -> None:
     """The history of faults, oldest first: when, what, where, how much, against which bound, and what it led to."""
-    with _one_line_errors():
+    with one_line_errors():
         import msgspec
 
         from runtime.faults import fault_file, load_faults

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from trotd.exits import BAD_INPUT, FAILED
+from trotd.exits import FAILED, one_line_errors
 
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="A shipped robot's name, or a .toml file.")]
 StateOption = Annotated[Path | None, typer.Option("--state", help="Folder of calibration and lock.", file_okay=False)]
@@ -21,23 +19,6 @@ def register(app: typer.Typer) -> None:
     app.command()(twin)
     app.command()(check)
     app.command()(commission)
-
-
-@contextlib.contextmanager
-def _one_line_errors() -> Iterator[None]:
-    """Bad input ends with one line and code 2; what the wires refuse with its report and code 1."""
-    from drivers.errors import DriverError
-    from runtime.config import ConfigError
-    from station.session import StationError
-
-    try:
-        yield
-    except (ConfigError, ImportError, ValueError) as error:
-        typer.echo(f"trotd: {error}", err=True)
-        raise typer.Exit(FAILED if isinstance(error, DriverError) else BAD_INPUT) from error
-    except (DriverError, StationError, OSError) as error:
-        typer.echo(f"trotd: {error}", err=True)
-        raise typer.Exit(FAILED) from error
 
 
 def twin(
@@ -59,7 +40,7 @@ def twin(
 
     Then drive it from another terminal with `trotd run --body twin`, or all at once with `trotd tour --wire`.
     """
-    with _one_line_errors():
+    with one_line_errors():
         from runtime import config
         from runtime.state import state_folder
         from trotd.twin import TwinOptions, serve_twin
@@ -81,7 +62,7 @@ def check(
 
     Exit code 1 if anything failed; warnings alone are 0.
     """
-    with _one_line_errors():
+    with one_line_errors():
         import asyncio
 
         from rich.console import Console
@@ -131,7 +112,7 @@ def commission(
 
     Afterwards, with the robot standing under `trotd run`: `trotd commission --baseline`, and start the daemon anew.
     """
-    with _one_line_errors():
+    with one_line_errors():
         from runtime import config
         from runtime.state import state_folder
         from trotd.commission import command

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trotd.cli_station import ENDPOINT, ConnectOption, RobotOption, UsageError, refusals
+from trotd.cli_station import ENDPOINT, ConnectOption, RobotOption
+from trotd.exits import UsageError, one_line_errors
 
 if TYPE_CHECKING:
     from station.session import Station
@@ -21,7 +22,7 @@ def _robot(robot: str, connect: str) -> Iterator[Station]:
     from runtime import config
     from station.session import connected
 
-    with refusals():
+    with one_line_errors():
         known = config.load(config.find_robot(robot))
         with connected(known.robot.name, connect) as station:
             yield station

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trotd.cli_station import ENDPOINT, ConnectOption, RobotOption, refusals
+from trotd.cli_station import ENDPOINT, ConnectOption, RobotOption
+from trotd.exits import one_line_errors
 
 if TYPE_CHECKING:
     from station.ros2 import Bridge
@@ -53,7 +54,7 @@ def ros2(
     from station.session import connected
 
     end = time.monotonic() + seconds if seconds > 0 else float("inf")
-    with refusals():
+    with one_line_errors():
         number = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
         known = config.load(config.find_robot(robot))
         with connected(known.robot.name, connect) as station, open_router(router) as ros:

@@ -2,46 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from trotd.exits import BAD_INPUT, FAILED, INTERRUPTED
+from trotd.exits import UsageError, one_line_errors
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 
 app = typer.Typer(no_args_is_help=True)
 RobotOption = Annotated[str, typer.Option("--robot", help="A shipped robot's name or a .toml file.")]
 ConnectOption = Annotated[str, typer.Option("--connect", help="Where the daemon listens.")]
-
-
-class UsageError(ValueError):
-    """Options that make no sense together: the message says which do."""
-
-
-@contextlib.contextmanager
-def refusals() -> Iterator[None]:
-    """Bad input as one line and exit code 2; what the robot, the link or the disk refuses as 1; Ctrl-C as 130."""
-    from runtime.config import ConfigError
-    from runtime.policies import PolicyError
-    from runtime.recording import RecordingError
-    from runtime.replay import ReplayError
-    from station.session import StationError
-
-    try:
-        yield
-    except (ConfigError, PolicyError, RecordingError, UsageError) as error:
-        typer.echo(f"trotd: {error}", err=True)
-        sys.exit(BAD_INPUT)
-    except (ReplayError, StationError, OSError) as error:
-        typer.echo(f"trotd: {error}", err=True)
-        sys.exit(FAILED)
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
 
 
 @app.command()
@@ -69,7 +42,7 @@ def view(
     from station.session import connected
 
     end = time.monotonic() + seconds if seconds > 0 else float("inf")
-    with refusals():
+    with one_line_errors():
         screen = viewer.Screen(save=save, web=web, web_port=web_port, grpc_port=port, memory=memory)
         if web:
             typer.echo(f"viewer: {screen.address}  (Ctrl-C ends it)", err=True)
@@ -108,7 +81,7 @@ def joystick(
     from station.desk import drive
     from station.session import connected
 
-    with refusals():
+    with one_line_errors():
         if keyboard and not sys.stdin.isatty():
             raise UsageError("--keyboard reads a terminal's keys, and this is none")
         known = config.load(config.find_robot(robot))
@@ -140,7 +113,7 @@ def monitor(
     from station.monitor import draw_table, watch
     from station.session import connected
 
-    with refusals():
+    with one_line_errors():
         known = config.load(config.find_robot(robot))
         peak = np.array(known.robot.joints.peak_torque)
         screen = Console()
@@ -207,7 +180,7 @@ def recordings(
     from runtime.messages.recording import RecordingEntry, RecordingReply
     from station.session import StationError, connected
 
-    with refusals():
+    with one_line_errors():
         known = config.load(config.find_robot(robot))
         with connected(known.robot.name, connect) as station:
             key = station.keys.recording
@@ -244,7 +217,7 @@ def replay(
     from runtime.replay import Player, compare_policy
     from runtime.replay import replay as play
 
-    with refusals():
+    with one_line_errors():
         loaded = load(recording)
         if policy is not None:
             other = compare_policy(loaded, policies.load(policy, loaded.header.robot))
@@ -285,7 +258,7 @@ def export(
     from runtime.recording import load
     from station.export import EXPORTS
 
-    with refusals():
+    with one_line_errors():
         wanted = {kind: path for kind, path in (("csv", csv), ("mcap", mcap), ("rrd", rrd)) if path is not None}
         if not wanted:
             raise UsageError("name at least one of --csv FILE, --mcap FILE, --rrd FILE")
@@ -307,7 +280,7 @@ def init_keys(authority: AuthorityOption = AUTHORITY) -> None:
     """Make a private certificate authority. Keep its folder off the robot."""
     from station.keys import make_authority
 
-    with refusals():
+    with one_line_errors():
         make_authority(authority)
         typer.echo(f"{authority}: the authority; its ca-key.pem leaves this machine never")
 
@@ -323,7 +296,7 @@ def add_key(
     from runtime.access import Role
     from station.keys import add_bearer
 
-    with refusals():
+    with one_line_errors():
         if role not in list(Role):
             raise UsageError(f"role {role!r}: must be one of {', '.join(Role)}")
         folder = add_bearer(authority, Role(role), name, tuple(host or ()))

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trotd.cli_training import RobotOption, WorkersOption, one_line_errors
+from trotd.cli_training import RobotOption, WorkersOption
+from trotd.exits import one_line_errors
 
 if TYPE_CHECKING:
     from training.checkpoint import Row

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trotd.cli_station import ENDPOINT
-from trotd.exits import BAD_INPUT, FAILED, INTERRUPTED
+from trotd.exits import INTERRUPTED, one_line_errors
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -32,35 +32,6 @@ def register(app: typer.Typer) -> None:
     app.command()(train)
     app.command()(evaluate)
     app.add_typer(policy_app, name="policy")
-
-
-@contextlib.contextmanager
-def one_line_errors() -> Iterator[None]:
-    """Whatever is wrong with what was asked leaves as one line and a code."""
-    from msgspec import ValidationError
-
-    from runtime.config import ConfigError
-    from runtime.policies import PolicyError
-    from station.session import StationError
-    from training.checkpoint import RunError
-    from training.inspection import NotLinear
-    from training.ray_evaluator import ClusterError
-    from training.reference import ReferenceMismatch
-
-    try:
-        yield
-    except (
-        ConfigError, PolicyError, RunError, NotLinear, ReferenceMismatch, ClusterError, StationError, ImportError,
-        ValidationError,
-    ) as error:  # fmt: skip
-        _leave(error, BAD_INPUT)
-    except OSError as error:
-        _leave(error, FAILED)
-
-
-def _leave(error: Exception, code: int) -> None:
-    typer.echo(f"trotd: {' '.join(str(error).split())}", err=True)
-    raise typer.Exit(code) from error
 
 
 def train(
@@ -315,10 +286,7 @@ def diff(
     with one_line_errors():
         from training.inspection import compare
 
-        try:
-            typer.echo(compare(_policy(first, robot), _policy(second, robot)))
-        except ValueError as error:
-            _leave(error, BAD_INPUT)
+        typer.echo(compare(_policy(first, robot), _policy(second, robot)))
 
 
 def _policy(name: str, robot: str) -> Policy:
