@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 from faults.report import shown
 from faults.shift import Shift, share, work
@@ -23,8 +26,6 @@ JsonOption = Annotated[bool, typer.Option("--json", help="The report as JSON.")]
 
 
 def _print_json(report: object) -> None:
-    import msgspec
-
     sys.stdout.write(msgspec.json.encode(report).decode() + "\n")
 
 
@@ -86,22 +87,41 @@ def sim(
     episode: Annotated[float, typer.Option(help="Simulated minutes of one robot.")] = 5.0,
     first: Annotated[int, typer.Option(help="The first seed.")] = 0,
     jobs: Annotated[int, typer.Option(help="Worker processes.")] = os.cpu_count() or 1,
+    keep: Annotated[
+        Path | None, typer.Option(help="Add each episode to this file, a line each; those that it has are not run.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Simulated hours of random commands and pushes of a size that must be borne, stops, sits and starts; free-running.
 
     A fall is printed with its seed and what had happened before; ``sim --first SEED --hours 0.08`` shows it again.
     """
-    count = max(1, round(60.0 * hours / episode))
-    items = [(first + seed, 60.0 * episode) for seed in range(count)]
-    results: list[Wandering] = list(shown(spread(items, wander, jobs), "episodes", count))
+    seeds = range(first, first + max(1, round(60.0 * hours / episode)))
+    results = [one for one in _kept(keep) if one.seed in seeds and one.seconds == 60.0 * episode]
+    items = [(seed, 60.0 * episode) for seed in seeds if seed not in {one.seed for one in results}]
+    with keep.open("ab") if keep is not None else contextlib.nullcontext() as file:
+        try:
+            for result in shown(spread(items, wander, jobs), "episodes", len(items)):
+                results.append(result)
+                if file is not None:
+                    file.write(msgspec.json.encode(result) + b"\n")
+                    file.flush()
+        except KeyboardInterrupt:
+            typer.echo(f"broken off after {len(results)} of {len(seeds)} episodes", err=True)
     failed = [result for result in results if result.falls or result.not_finite or result.over_limit]
     if json:
         _print_json(results)
     else:
         _print_hours(results, failed)
-    if failed:
+    if failed or len(results) < len(seeds):
         raise typer.Exit(FAILED)
+
+
+def _kept(path: Path | None) -> list[Wandering]:
+    """Episodes of earlier runs; none where there is no such file."""
+    if path is None or not path.exists():
+        return []
+    return [msgspec.json.decode(line, type=Wandering) for line in path.read_bytes().splitlines()]
 
 
 def _print_hours(results: list[Wandering], failed: list[Wandering]) -> None:
@@ -118,13 +138,13 @@ def _print_hours(results: list[Wandering], failed: list[Wandering]) -> None:
     console.print(
         f"falls {sum(len(r.falls) for r in results)} · commands not finite {sum(r.not_finite for r in results)}"
         f" · past the torque limit {sum(r.over_limit for r in results)}"
-        f" · largest torque {max(r.torque for r in results):.1f} N·m"
+        f" · largest torque {max((r.torque for r in results), default=0.0):.1f} N·m"
     )
     console.print(f"other ends in damp: {faults or 'none'}")
     for result in failed:
         for fall in result.falls:
             console.print(f"seed {result.seed}: {fall}", markup=False)
-    console.print("FAILED" if failed else "passed", style="bold")
+    console.print("FAILED" if failed else "nothing failed", style="bold")
 
 
 if __name__ == "__main__":
