@@ -103,6 +103,9 @@ def _read(left: Path) -> tuple[Header, float, Rows]:
     places = ticks.whole()
     if rows.shape != ticks.rows.shape:
         raise CrashError("its ticks are not what its header says")
+    for name in ("index", "stamp", "armed"):
+        if name not in (rows.dtype.names or ()) or rows.dtype[name].shape:
+            raise CrashError(f"its header tells no number {name!r} of a tick")
     if not len(places):
         return run.header, run.epoch, ticks
     ended = run.epoch + float(rows["stamp"][places[-1]])

@@ -138,6 +138,26 @@ def test_a_damaged_ring_is_named_and_gone_or_gives_ticks(
     assert not left.exists()
 
 
+@pytest.mark.parametrize(("name", "kind", "shape"), [
+    ("stamp", "<f8", [28]), ("armed", "|u1", [2]), ("index", "<u8", [3]), ("stamp", None, []),
+])  # fmt: skip
+def test_a_header_that_says_nonsense_of_a_tick_is_named_and_gone(
+    memory: Path, tmp_path: Path, name: str, kind: str | None, shape: list[int]
+) -> None:
+    (left,) = crash.claim(memory)
+    table = json.loads((left / crash.HEADER).read_bytes())
+    layout = table["header"]["layout"]
+    (place,) = (row for row, field in enumerate(layout) if field[0] == name)
+    if kind is None:
+        del layout[place]
+    else:
+        layout[place][1:3] = kind, shape
+    (left / crash.HEADER).write_bytes(json.dumps(table).encode())
+    with pytest.raises(crash.CrashError, match=name):
+        crash.salvage(left, tmp_path / "shelf", 9, 10**9)
+    assert not left.exists()
+
+
 @given(st.text(max_size=2000), st.integers(0, 2**60))
 def test_an_event_fits_its_room_and_stays_json(text: str, tick: int) -> None:
     row = event_row(Event(stamp=1.5, tick=tick, kind="recording", text=text))
