@@ -40,8 +40,8 @@ def daemon(
 ) -> None:
     """The daemon walks on the simulator or its wire twin in real time: a joystick drives, a monitor and a viewer watch.
 
-    Its memory may grow by 5 MiB; it may not fall, nor leave the walk unasked. Missed ticks are counted: on a busy
-    machine they say more about the machine.
+    Its memory may grow by 5 MiB; it may not fall, nor leave the walk unasked. Missed ticks are counted, and so are halts
+    because the loop came too late, after which it walks on: on a busy machine they say more about the machine.
     """
     console = Console(stderr=True)
     with console.status("starting the daemon") as line:
@@ -71,6 +71,7 @@ def _print_shift(shift: Shift, problems: list[str]) -> None:
         ),
         ("wires", ", ".join(f"{count} {name}" for name, count in shift.wires.items()) or "nothing lost, nothing late"),
         ("memory", f"{shift.resident:.1f} MiB, grew by {shift.growth:.2f}, bound {GROWTH:g}"),
+        ("halts", f"{len(shift.halts)} because the loop came late {', '.join(shift.halts)}"),
         ("falls", str(shift.falls)),
     ):
         table.add_row(name, value)

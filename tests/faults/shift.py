@@ -22,6 +22,7 @@ from runtime import config
 from runtime.messages.mode import Mode, Request
 from runtime.messages.simulation import SimTruth
 from runtime.messages.status import Status
+from runtime.reasons import Reason
 from station.driving import Driving
 from station.joystick import Joystick
 from station.pad import Sticks
@@ -63,6 +64,8 @@ class Shift(msgspec.Struct, kw_only=True):
     """m."""
     ends: list[str] = []
     """Every change of mode that was not asked for."""
+    halts: list[str] = []
+    """Of a walk, because the computer came too late for it; it was asked to walk on."""
     clients: dict[str, str] = {}
     """How each ended."""
     recording: bool = False
@@ -125,7 +128,7 @@ def work(minutes: float, robot: str, body: str, rate_hz: float, watched: bool, s
     Raises:
         StationError: the daemon does not start.
     """
-    shift = Shift(minutes=minutes, rate_hz=rate_hz, ends=[], clients={})
+    shift = Shift(minutes=minutes, rate_hz=rate_hz, ends=[], halts=[], clients={})
     with tempfile.TemporaryDirectory(prefix="trotd-soak-") as place, contextlib.ExitStack() as stack:
         folder, endpoint = Path(place), free_endpoint()
         arguments = ["--robot", robot, "--rate-hz", f"{rate_hz:g}", "--state", str(folder)]
@@ -192,7 +195,11 @@ def _drive(station: Station, daemon: subprocess.Popen[bytes], shift: Shift, show
                 heard, stolen = status, taken
             if status.mode != mode:
                 mode = status.mode
-                shift.ends.append(f"{now:.0f} s {mode}: {status.fault or status.reason}")
+                if mode == Mode.STAND.name and status.reason == Reason.LATE_LOOP.words:
+                    shift.halts.append(f"{now:.0f} s")
+                    request(station, Request.WALK)
+                elif mode != Mode.WALK.name or not shift.halts:
+                    shift.ends.append(f"{now:.0f} s {mode}: {status.fault or status.reason}")
         if now - looked >= STEADY:
             looked = now
             memory.append((now, resident(process)))
