@@ -40,7 +40,7 @@ def daemon(
 ) -> None:
     """The daemon walks on the simulator or its wire twin in real time: a joystick drives, a monitor and a viewer watch.
 
-    Its memory may grow by 5 MiB; it may not fall, nor leave the walk unasked. Missed ticks are counted, and so are halts
+    Its memory may grow by 5 MiB; it may not fall, nor leave the walk unasked. Missed ticks are counted, so are halts
     because the loop came too late, after which it walks on: on a busy machine they say more about the machine.
     """
     console = Console(stderr=True)
