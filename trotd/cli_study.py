@@ -36,7 +36,7 @@ def seeds(
     ),
     robot: RobotOption = "stoch3",
     iterations: IterationsOption = 20,
-    directions: DirectionsOption = 32,
+    directions: DirectionsOption = 64,
     workers: WorkersOption = 0,
     json: JsonOption = False,
 ) -> None:
