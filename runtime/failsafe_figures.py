@@ -45,13 +45,12 @@ fault, m/s is the body's speed as it touched the ground.
 
 
 def figures(path: Path) -> str:
-    """The table of the file at ``path``; nothing where there is no such file.
+    """The table of the file at ``path``.
 
     Raises:
+        OSError: no such file.
         msgspec.ValidationError: not a file of torture's.
     """
-    if not path.exists():
-        return ""
     rows = msgspec.json.decode(path.read_bytes(), type=dict[str, dict[str, Worst]])
     return HEAD + "".join(_line(row, gait, worst) for row, gaits in rows.items() for gait, worst in gaits.items())
 

@@ -49,17 +49,12 @@ class Screen:
 
     def __post_init__(self) -> None:
         """Raises StationError for a ``memory`` that is no number and unit."""
-        _ = self.kept
+        parse_size(self.memory)
 
     @property
     def kept(self) -> int:
         """Bytes that this process may keep for whoever looks at it later."""
-        unit = self.memory.lstrip("0123456789.")
-        try:
-            size = float(self.memory.removesuffix(unit)) * UNITS[unit]
-        except (ValueError, KeyError) as error:
-            raise StationError(f"memory {self.memory!r}: a number and one of {', '.join(UNITS)}") from error
-        return round(size) if self.web else 0
+        return parse_size(self.memory) if self.web else 0
 
     @property
     def address(self) -> str:
@@ -98,6 +93,19 @@ class Screen:
         except (OSError, RuntimeError) as error:
             raise StationError(f"viewer: {error}") from error
         return stream
+
+
+def parse_size(words: str) -> int:
+    """``1.5GiB`` in bytes.
+
+    Raises:
+        StationError: no number, or another unit than those of ``UNITS``.
+    """
+    unit = words.lstrip("0123456789.")
+    try:
+        return round(float(words.removesuffix(unit)) * UNITS[unit])
+    except (ValueError, KeyError) as error:
+        raise StationError(f"memory {words!r}: a number and one of {', '.join(UNITS)}") from error
 
 
 def _need_display() -> None:

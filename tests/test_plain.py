@@ -36,7 +36,7 @@ def close(found: Any, wanted: Any, bound: float, what: str, tick: int) -> None:
     assert error <= bound + 1e-9 * np.abs(wanted).max(), f"{what} at tick {tick}: {found} for {wanted}"
 
 
-def agree(name: str, chosen: Policy, measurements: Sequence[Measurement], **changes: Any) -> Clamp:
+def assert_agree(name: str, chosen: Policy, measurements: Sequence[Measurement], **changes: Any) -> Clamp:
     """Run both; returns every clamp that acted."""
     compiled = controller(name, chosen, **changes)
     plain = PlainController(robot(name).robot, control(name, **changes), chosen)
@@ -98,19 +98,19 @@ def random_measurements(name: str, seed: int, count: int = 72) -> list[Measureme
 
 @pytest.mark.parametrize("gait", GAITS)
 def test_every_gait_over_a_walk(gait: str) -> None:
-    agree("stoch3", policy(), walked("stoch3", "trot" if gait == "stand" else gait), gait={"name": gait})
+    assert_agree("stoch3", policy(), walked("stoch3", "trot" if gait == "stand" else gait), gait={"name": gait})
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_over_a_walk(name: str) -> None:
-    agree(name, policy(name), walked(name))
+    assert_agree(name, policy(name), walked(name))
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("gait", GAITS)
 def test_random_inputs(name: str, gait: str) -> None:
     seed = zlib.crc32(f"{name}{gait}".encode())
-    clamps = agree(name, policy(name), random_measurements(name, seed), gait={"name": gait})
+    clamps = assert_agree(name, policy(name), random_measurements(name, seed), gait={"name": gait})
     assert clamps & Clamp.COMMAND and clamps & Clamp.OBSERVATION and clamps & Clamp.FRICTION
 
 
@@ -143,13 +143,13 @@ ALL_ON = Terms(
 @pytest.mark.parametrize("terms", [ALL_OFF, ALL_ON], ids=["terms off", "terms on"])
 def test_both_readings_with_all_terms_on_and_off(reading: str, terms: Terms) -> None:
     chosen = random_policy(1, reading=reading, terms=terms)
-    assert agree("stoch3", chosen, walked()) & Clamp.SHIFT
-    agree("stoch3", chosen, random_measurements("stoch3", 2))
+    assert assert_agree("stoch3", chosen, walked()) & Clamp.SHIFT
+    assert_agree("stoch3", chosen, random_measurements("stoch3", 2))
 
 
 @pytest.mark.parametrize("term", [name for name in Terms.__struct_fields__ if not name.startswith("integral_")])
 def test_each_term_alone(term: str) -> None:
-    agree("stoch3", random_policy(3, terms=Terms(**{term: 0.3})), walked()[:120])
+    assert_agree("stoch3", random_policy(3, terms=Terms(**{term: 0.3})), walked()[:120])
 
 
 @pytest.mark.parametrize("hidden", [1, 7, 32])
@@ -157,7 +157,7 @@ def test_small_network(hidden: int) -> None:
     rng = np.random.default_rng(4)
     layers = rng.normal(0, 0.3, (hidden, 28)), rng.normal(0, 0.5, (18, hidden))
     chosen = random_policy(5, hidden=tuple(map(tuple, layers[0])), readout=tuple(map(tuple, layers[1])))
-    agree("stoch3", variant(chosen, matrix=()), walked()[:120])
+    assert_agree("stoch3", variant(chosen, matrix=()), walked()[:120])
 
 
 def test_direct_forces() -> None:
@@ -170,11 +170,11 @@ def test_direct_forces() -> None:
         action_scale=(0.1,) * 12 + (60.0,) * 12,
         action_bound=(0.1,) * 12 + (20.0,) * 12,
     )
-    assert agree("stoch3", chosen, walked()[:120]) & Clamp.WRENCH
+    assert assert_agree("stoch3", chosen, walked()[:120]) & Clamp.WRENCH
 
 
 def test_other_rates_and_settings() -> None:
-    agree(
+    assert_agree(
         "stoch3",
         policy(),
         walked(),
@@ -189,7 +189,7 @@ def test_other_rates_and_settings() -> None:
 
 def test_standing_still_agrees_and_is_solved() -> None:
     still = [standing()] * 50
-    agree("stoch3", policy(), still)
+    assert_agree("stoch3", policy(), still)
     compiled = controller()
     compiled.reset(still[0])
     compiled.step(still[0], VelocityCommand(), True)

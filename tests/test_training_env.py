@@ -36,6 +36,7 @@ def stage() -> Iterator[Stage]:
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")
 def test_gymnasiums_own_checker_passes(env: WalkEnv) -> None:
     check_env(env, skip_render_check=True)
+    assert env.observation_space.contains(env.reset(seed=1)[0]), "and it is left in working order"
 
 
 def test_the_same_seed_is_the_same_episode(env: WalkEnv) -> None:

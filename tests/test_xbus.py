@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers import mtdata2, xbus
 from drivers.errors import CorruptFrame
-from drivers.mtdata2 import Data, SampleDecoder, decode_data
+from drivers.mtdata2 import Data, Sample, SampleDecoder, decode_data
 from drivers.xbus import Message, Output, XbusParser
 
 RECORDED = tomllib.loads((Path(__file__).parent / "data" / "xbus.toml").read_text())
@@ -193,11 +193,12 @@ def test_nothing_is_kept_for_ever(chunks):
 @given(st.binary(max_size=80))
 @settings(max_examples=300)
 def test_any_data_decodes_or_is_called_corrupt(data):
-    for decode in (decode_data, SampleDecoder().decode):
+    for decode, kind in ((decode_data, dict), (SampleDecoder().decode, Sample)):
         try:
-            decode(data)
+            found = decode(data)
         except CorruptFrame:
             continue
+        assert isinstance(found, kind)
 
 
 def test_status_bits_of_the_recorded_shake():

@@ -87,23 +87,20 @@ def select(config: Config, folder: RunFolder, workers: int, say: Callable[[str],
     last_stage = [row.iteration for row in folder.curve() if row.stage == folder.curve()[-1].stage]
     last = [number for number in numbers if number in last_stage] or numbers
     chosen = sorted({last[round(k)] for k in np.linspace(len(last) // 3, len(last) - 1, CANDIDATES)})
-    robot = config.robot.name
-    candidates = {(number, 1): policies.load(folder.policy_file(number), robot) for number in chosen}
     half = last[len(last) // 2 :]
-    candidates[half[-1], len(half)] = mean_of([policies.load(folder.policy_file(number), robot) for number in half])
-    verdicts: dict[tuple[int, int], Verdict] = {}
+    mean = folder.path / "mean.json"
+    members = [policies.load(folder.policy_file(number), config.robot.name) for number in half]
+    write_whole(mean, encode_policy(mean_of(members)))
+    candidates = [(folder.policy_file(number), number, 1) for number in chosen] + [(mean, half[-1], len(half))]
+    verdicts: list[Verdict] = []
     with Contest(config, workers) as contest:
-        for (number, averaged), policy in candidates.items():
-            path = folder.policy_file(number)
-            if averaged > 1:
-                path = folder.path / "mean.json"
-                write_whole(path, encode_policy(policy))
-            verdict = judge(contest, Contender(f"{number} {averaged}", "policy", str(path)), number, averaged)
-            say(f"validation of {number}: {msgspec.to_builtins(verdict)}, score {verdict.score:.0f}")
-            verdicts[number, averaged] = verdict
-    best = candidates[max(verdicts, key=lambda key: verdicts[key].score)]
-    results = [msgspec.to_builtins(verdict) for verdict in verdicts.values()]
-    return msgspec.structs.replace(best, provenance=best.provenance | {"validation": results})
+        for path, number, averaged in candidates:
+            verdicts.append(judge(contest, Contender(path.stem, "policy", str(path)), number, averaged))
+            say(f"validation of {path.stem}: {msgspec.to_builtins(verdicts[-1])}, score {verdicts[-1].score:.0f}")
+    best = max(range(len(verdicts)), key=lambda place: verdicts[place].score)
+    policy = policies.load(candidates[best][0], config.robot.name)
+    results = [msgspec.to_builtins(verdict) for verdict in verdicts]
+    return msgspec.structs.replace(policy, provenance=policy.provenance | {"validation": results})
 
 
 def mean_of(members: Sequence[Policy]) -> Policy:

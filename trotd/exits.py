@@ -21,24 +21,25 @@ class UsageError(ValueError):
 
 @contextlib.contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Leave with one line and a code where robot, link, disk or what was given say no; a fault of ours is raised.
+    """Leave with one line and a code where robot, link, disk or what was given say no; anything else is raised.
 
-    A report of several lines, one for each wire, stays what it is.
+    What the drivers gathered over all wires stays a report of several lines. Every ValueError counts as bad input: the
+    doors' errors are ValueErrors.
     """
     try:
         yield
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
-        code = _code(error)
+        code, words = _told(error)
         if code is None:
             raise
-        typer.echo(f"trotd: {error}", err=True)
+        typer.echo(f"trotd: {words}", err=True)
         raise typer.Exit(code) from error
 
 
-def _code(error: Exception) -> int | None:
-    """Configurations, policies, recordings and runs that cannot be used are ValueErrors."""
+def _told(error: Exception) -> tuple[int | None, str]:
+    """Exit code, None for what no command expects, and what is printed."""
     from drivers.errors import DriverError
     from runtime.link import LinkError
     from runtime.realtime import RealtimeError
@@ -46,8 +47,11 @@ def _code(error: Exception) -> int | None:
     from runtime.state import LockError
     from station.session import StationError
 
-    if isinstance(error, DriverError | StationError | ReplayError | OSError):
-        return FAILED
+    if isinstance(error, DriverError):
+        return FAILED, str(error)
+    words = " ".join(str(error).split())
+    if isinstance(error, StationError | ReplayError | OSError):
+        return FAILED, words
     if isinstance(error, ValueError | LinkError | LockError | RealtimeError | ImportError):
-        return BAD_INPUT
-    return None
+        return BAD_INPUT, words
+    return None, words

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from faults import process
 from faults.watch import Outcome
+from runtime.failsafe_figures import Worst
 
 SHOWN = 40
 """Violations printed in full."""
@@ -126,18 +127,18 @@ def worst(outcomes: Sequence[Outcome]) -> bytes:
     def most(values: Iterable[Any]) -> Any:
         return max((value for value in values if value is not None), default=None)
 
-    rows: dict[str, dict[str, Any]] = {}
+    rows: dict[str, dict[str, Worst]] = {}
     for (row, gait), members in group(outcomes).items():
         after = [o.answered - o.evidence for o in members if o.answered is not None and o.evidence is not None]
-        rows.setdefault(row, {})[gait] = {
-            "faults": len(members),
-            "ends": dict(Counter(outcome.ends for outcome in members).most_common()),
-            "answered_ticks": most(outcome.answered for outcome in members),
-            "ticks_from_evidence": most(after),
-            "torque": most(round(outcome.torque, 2) for outcome in members),
-            "joint_speed": most(round(outcome.speed, 2) for outcome in members),
-            "impact": most(round(o.impact, 2) for o in members if o.impact is not None),
-            "falls_before_answer": sum(outcome.fell for outcome in members),
-            "violations": sum(bool(outcome.violations) for outcome in members),
-        }
+        rows.setdefault(row, {})[gait] = Worst(
+            faults=len(members),
+            ends=dict(Counter(outcome.ends for outcome in members).most_common()),
+            answered_ticks=most(outcome.answered for outcome in members),
+            ticks_from_evidence=most(after),
+            torque=most(round(outcome.torque, 2) for outcome in members),
+            joint_speed=most(round(outcome.speed, 2) for outcome in members),
+            impact=most(round(o.impact, 2) for o in members if o.impact is not None),
+            falls_before_answer=sum(outcome.fell for outcome in members),
+            violations=sum(bool(outcome.violations) for outcome in members),
+        )
     return msgspec.json.format(msgspec.json.encode(rows), indent=1) + b"\n"
