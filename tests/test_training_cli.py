@@ -14,6 +14,8 @@ from station.push import active
 from trotd.cli import app
 
 RUN = ["--iterations", "1", "--directions", "1", "--ticks", "40", "--no-validate", "--workers", "1"]
+STAGES = 4
+"""Of a run from zero: so many iterations are played where each has one."""
 
 
 def call(*arguments: str) -> tuple[int, str]:
@@ -32,7 +34,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_leaves_all_that_is_needed_to_make_it_again(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
     assert names >= {"run.json", "versions.json", "curve.jsonl", "reference.npz", "checkpoints", "tried.json"}
-    assert len((finished / "curve.jsonl").read_text().splitlines()) == 3
+    assert len((finished / "curve.jsonl").read_text().splitlines()) == STAGES
     policy = policies.load(finished / "tried.json", "stoch3")
     assert policy.provenance["run"] == json.loads((finished / "run.json").read_text())
     assert policy.provenance["versions"]["numpy"] == np.__version__
@@ -93,8 +95,8 @@ def test_every_iteration_is_pushed_to_the_running_robot(tmp_path: Path) -> None:
         code, output = call("train", "--out", str(folder), "--name", "live", "--push", "--connect", endpoint, *RUN)
         assert code == 0, output
         policy, digest = active(station)
-        last = (folder / "checkpoints" / "0003.json").read_bytes()
-    assert output.count("s  pushed") == 3
+        last = (folder / "checkpoints" / f"{STAGES:04d}.json").read_bytes()
+    assert output.count("s  pushed") == STAGES
     assert digest == hashlib.sha256(last).hexdigest() != before
     assert policy.name == "live"
 
