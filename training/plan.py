@@ -23,8 +23,8 @@ class StagePlan(Record, frozen=True, kw_only=True):
     iterations: Count
     directions: Count = 64
     ticks: Count = 1000
-    conditions: str = "imitation"
-    """One of ``training.randomize.SETS``."""
+    conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "rough"] = "imitation"
+    """Bounds of the draws: ``training.randomize.SETS``."""
     symmetry: Literal["none", "left-right", "both"] = "left-right"
     stdev: Positive = 0.1
     stdev_learning_rate: NonNegative = 0.1

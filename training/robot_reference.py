@@ -11,7 +11,7 @@ from sim.world import World
 from training.mpc_controller import MpcController
 from training.provenance import config_hash
 from training.randomize import Conditions
-from training.reference import TICKS, Commands, Reference, ReferenceMismatch, ramp
+from training.reference import TICKS, Commands, Reference, ReferenceMismatch, make_reference, ramp
 from training.reward import FEATURES, fill_features
 from training.rigid_body import GRAVITY
 from training.rollout import walk
@@ -44,3 +44,16 @@ def record_reference(config: Config, commands: Commands = ramp, ticks: int = TIC
     if fell:
         raise ReferenceMismatch(f"the teacher fell after {steps} ticks: there is no walk to imitate")
     return Reference(config.robot.name, config_hash(config), "robot", control.rate_hz, features, asked)
+
+
+def walked_by(source: str, config: Config) -> Reference:
+    """The episode D of either teacher: ``rigid-body``, the MPC's own model, or ``robot``, the MPC on the robot.
+
+    Raises:
+        ReferenceMismatch: another name, or a teacher that fell.
+    """
+    if source == "rigid-body":
+        return make_reference(config)
+    if source == "robot":
+        return record_reference(config)
+    raise ReferenceMismatch(f"no teacher {source!r}: rigid-body or robot")

@@ -15,11 +15,11 @@ import numpy as np
 from runtime.config import Config
 from runtime.control.policy import Policy
 from sim.scenario import Scenario
-from training.checkpoint import RunFolder
+from training.checkpoint import RunError, RunFolder
 from training.mpc_controller import MpcController
 from training.plan import IMITATE, PHYSICS_RATE_HZ, RunPlan, StagePlan
 from training.provenance import config_hash, versions
-from training.randomize import NOISY, SENSORS, Conditions, draw
+from training.randomize import IMITATION, SENSORS, Conditions, draw
 from training.reference import Reference
 from training.reward import TableReward
 from training.rollout import Setup, Stage, Task
@@ -27,7 +27,7 @@ from training.selection import VALIDATION_SEED
 from training.trainer import MakeEvaluator, Report, Trainer
 from training.variants import Variant, make_policy
 
-DRAWS = 8
+DRAWS = 16
 """Episodes that judge a finished run."""
 FULL_LENGTH = 1000
 """Their ticks: the whole reference."""
@@ -45,6 +45,8 @@ class Imitated:
     """First iteration whose mean scored more than the teacher in the same episode; 0 for none."""
     share: float
     """Of the largest return, over the judging episodes at the full length."""
+    of_teacher: float
+    """Of the teacher's own return in the same episodes."""
     fell: float
     """Share of them."""
 
@@ -79,9 +81,9 @@ def _play(stage: Stage, ticks: int, tasks: Sequence[Task]) -> list[tuple[float, 
 
 
 def judging_tasks(parameters: np.ndarray) -> list[Task]:
-    """Noise, friction and sensors' biases that training never saw."""
+    """Spawns tilted by up to 0.2 rad, friction, noise and sensors' biases that training never saw."""
     rng = np.random.default_rng(VALIDATION_SEED)
-    return [Task(parameters, draw(NOISY, rng)) for _ in range(DRAWS)]
+    return [Task(parameters, draw(IMITATION, rng)) for _ in range(DRAWS)]
 
 
 def own_task(parameters: np.ndarray) -> Task:
@@ -99,38 +101,47 @@ def study(
     stage: StagePlan = IMITATE,
     terms: bool = False,
 ) -> Iterator[Imitated]:
-    """Train (variant, seed) after (variant, seed), skipping what ``folder`` has already; judge them all alike."""
+    """Judge the teacher, then train (variant, seed) after (variant, seed) and judge each by the same episodes.
+
+    What ``folder`` has already is not trained again.
+
+    Raises:
+        RunError: a run of another reference, stage or config lies there.
+    """
     judge = Judge(config, reference)
+    share, fell = _means(judge.teacher(FULL_LENGTH, judging_tasks(np.zeros(0))))
+    yield Imitated("mpc", 0, 0, 0, share, 1.0, fell)
     for variant, seed in runs:
         plan = msgspec.convert(
             {
                 "name": f"{variant}-{seed}", "robot": config.robot.name, "config": config_hash(config), "seed": seed,
-                "variant": variant, "terms": terms, "stages": (stage,),
+                "variant": variant, "terms": terms, "reference": reference.source, "stages": (stage,),
             },
             RunPlan,
         )  # fmt: skip
-        run = RunFolder(folder / plan.name)
-        if not (run.path / "run.json").exists():
-            run.begin(plan, versions())
-        trainer = Trainer(config, run.plan(config_hash(config)), run, make_evaluator, reference)
+        run = _opened(RunFolder(folder / plan.name), plan)
+        trainer = Trainer(config, plan, run, make_evaluator, reference)
         trainer.run(run.load() if run.iterations() else trainer.start(), report)
-        yield _judged(judge, trainer, run)
+        yield _judged(judge, trainer, run, share)
 
 
-def teacher_result(config: Config, reference: Reference) -> Imitated:
-    """The MPC's own row of the table."""
-    shares = Judge(config, reference).teacher(FULL_LENGTH, judging_tasks(np.zeros(0)))
-    return Imitated("mpc", 0, 0, 0, *_means(shares))
+def _opened(run: RunFolder, plan: RunPlan) -> RunFolder:
+    """The run's folder, begun or found as the same plan left it."""
+    if not (run.path / "run.json").exists():
+        run.begin(plan, versions())
+    elif run.plan(plan.config) != plan:
+        raise RunError(f"{run.path} is a run of another plan (reference, stage or terms): choose another --out")
+    return run
 
 
-def _judged(judge: Judge, trainer: Trainer, run: RunFolder) -> Imitated:
+def _judged(judge: Judge, trainer: Trainer, run: RunFolder, teacher_share: float) -> Imitated:
     plan, ticks = trainer.plan, trainer.plan.stages[0].ticks
     ((bar, _),) = judge.teacher(ticks, [own_task(np.zeros(0))])
     wanted = bar * TableReward().best * ticks
     passed = next((row.iteration for row in run.curve() if row.mean_return > wanted), 0)
     parameters = trainer.policy(run.load()).parameters
-    shares = judge.trained(trainer.template, FULL_LENGTH, judging_tasks(parameters))
-    return Imitated(plan.variant, plan.seed, parameters.size, passed, *_means(shares))
+    share, fell = _means(judge.trained(trainer.template, FULL_LENGTH, judging_tasks(parameters)))
+    return Imitated(plan.variant, plan.seed, parameters.size, passed, share, share / teacher_share, fell)
 
 
 def _means(shares: Sequence[tuple[float, bool]]) -> tuple[float, float]:

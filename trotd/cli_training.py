@@ -94,14 +94,14 @@ def _load(robot: str) -> tuple[Config, Path]:
 
 
 def _reference(config: Config, plan: RunPlan, saved: Path | None) -> Reference | None:
-    from training.reference import load_reference, make_reference
-    from training.robot_reference import record_reference
+    from training.reference import load_reference
+    from training.robot_reference import walked_by
 
     if not any(stage.reward == "table" for stage in plan.stages):
         return None
     if saved is not None:
         return load_reference(saved, config)
-    return make_reference(config) if plan.reference == "rigid-body" else record_reference(config)
+    return walked_by(plan.reference, config)
 
 
 def _trainer(
