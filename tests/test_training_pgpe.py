@@ -108,6 +108,17 @@ def rastrigin(x: Array) -> float:
     return -float((x**2 - 10 * np.cos(2 * np.pi * x) + 10).sum())
 
 
+def test_weight_decay_forgets_what_no_return_asks_for_and_keeps_what_one_does() -> None:
+    params = Params(directions=32, learning_rate=0.02, learning_rate_end=0.02, weight_decay=1.0)
+    rng, state = np.random.default_rng(5), pgpe.start(np.array([2.0, 2.0]), 0.05)
+    for _ in range(150):
+        population = pgpe.ask(state, params, rng)
+        fitness = -np.abs(population[:, 0] - 0.7)
+        state = pgpe.tell(state, params, population, pgpe.centred_ranks(fitness))
+    assert abs(state.mean[0] - 0.7) < 0.1
+    assert abs(state.mean[1]) < 0.5
+
+
 def test_climbs_the_sphere() -> None:
     state = climb(sphere, np.zeros(20), 150, 0.3)
     assert sphere(state.mean) > -0.05

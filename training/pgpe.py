@@ -28,6 +28,8 @@ class Params:
     """0 keeps the stdev as it is."""
     stdev_max_change: float = 0.2
     """Share of itself by which a stdev may change in an iteration."""
+    weight_decay: float = 0.0
+    """Share of itself that the mean loses in an iteration, times the learning rate: what no return asks for fades."""
     adam_mean_decay: float = 0.9
     adam_square_decay: float = 0.999
     adam_epsilon: float = 1e-8
@@ -112,7 +114,8 @@ def tell(state: State, params: Params, population: Array, utilities: Array) -> S
     unbiased_first = first / (1 - params.adam_mean_decay**step)
     unbiased_second = second / (1 - params.adam_square_decay**step)
     rate = _learning_rate(params, state.iteration)
-    mean = state.mean + rate * unbiased_first / (np.sqrt(unbiased_second) + params.adam_epsilon)
+    step_taken = unbiased_first / (np.sqrt(unbiased_second) + params.adam_epsilon)
+    mean = state.mean + rate * (step_taken - params.weight_decay * state.mean)
     allowed = params.stdev_max_change * state.stdev
     change = np.clip(params.stdev_learning_rate * stdev_gradient, -allowed, allowed)
     return State(mean, state.stdev + change, first, second, step)

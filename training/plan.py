@@ -30,6 +30,8 @@ class StagePlan(Record, frozen=True, kw_only=True):
     stdev_learning_rate: NonNegative = 0.1
     learning_rate: Positive = 0.05
     learning_rate_end: Positive = 0.05
+    weight_decay: NonNegative = 0.0
+    """Pull of every number towards zero (``pgpe.Params``)."""
     fall_weight: NonNegative = 0.0
     """Above zero the pairs are ranked among themselves, with this weight of a fall (``pgpe.paired_ranks``)."""
 

@@ -144,6 +144,7 @@ class Trainer:
             learning_rate_end=stage.learning_rate_end,
             learning_rate_steps=stage.iterations,
             stdev_learning_rate=stage.stdev_learning_rate,
+            weight_decay=stage.weight_decay,
         )
         return _Course(stage, folding_of(self.template, stage.symmetry), params)
 
