@@ -83,7 +83,7 @@ POLISH = msgspec.structs.replace(
 )  # fmt: skip
 """What was shed is won back, where it serves."""
 REFINE = msgspec.structs.replace(
-    SERVE, name="refine", iterations=60, stdev=0.03, learning_rate=0.01, learning_rate_end=0.001
+    POLISH, name="refine", learning_rate=0.015, learning_rate_end=0.0015, weight_decay=0.05
 )
 """From numbers that already walk: smaller steps, or what they know is lost before anything is learnt."""
 ROUGHEN = StagePlan(
