@@ -2,16 +2,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from runtime import config as configuration
-from runtime.policies import PolicyError
+from runtime.policies import PolicyError, find_policy
 from sim.scenario import Push, Scenario
 from sim.world import World
 from training import table
-from training.contest import BUILT_IN, Contender, Outcome, Trial, find_contender, run_trial
+from training.contest import BUILT_IN, Contender, Outcome, Trial, find_contender, find_contenders, run_trial
 from training.evaluation import Report
 from training.mpc_controller import MpcController, centre_state, put_forces
 from training.randomize import SENSORS, Conditions
@@ -106,6 +107,13 @@ def test_contenders_are_found_or_refused_by_name() -> None:
     assert find_contender("balance.json").kind == "policy"
     with pytest.raises(PolicyError, match="no-such"):
         find_contender("no-such")
+
+
+def test_policies_that_are_called_alike_keep_a_column_each(tmp_path: Path) -> None:
+    mine = tmp_path / "trot.json"
+    mine.write_bytes(find_policy("balance").read_bytes())
+    names = [contender.name for contender in find_contenders([str(mine), "mpc", "trot", "mpc", "balance"])]
+    assert names == [str(mine), "mpc", "trot", "balance"]
 
 
 class Threshold:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
@@ -66,6 +67,19 @@ def find_contender(name: str, beside: Path | None = None) -> Contender:
         return Contender(name, name)  # type: ignore[arg-type]
     path = policies.find_policy(name, beside)
     return Contender(path.stem, "policy", str(path))
+
+
+def find_contenders(names: Sequence[str], beside: Path | None = None) -> list[Contender]:
+    """Each name's contender once, in order; policies whose files are called alike go by what they were asked for by.
+
+    Raises:
+        PolicyError: one is none of those that ``find_contender`` knows.
+    """
+    found: dict[Contender, str] = {}
+    for name in names:
+        found.setdefault(find_contender(name, beside), name)
+    count = Counter(contender.name for contender in found)
+    return [replace(one, name=asked) if count[one.name] > 1 else one for one, asked in found.items()]
 
 
 @dataclass(frozen=True, slots=True)

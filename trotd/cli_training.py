@@ -218,7 +218,7 @@ def _show_table(
     config: Config, names: list[str], workers: int, quick: bool, rough: bool = False, only: list[str] | None = None,
     json: bool = False, beside: Path | None = None,
 ) -> str:  # fmt: skip
-    from training.contest import find_contender
+    from training.contest import find_contenders
     from training.evaluation import evaluate as play
     from training.table import FULL, QUICK, make_rough_tests, make_tests
 
@@ -230,7 +230,7 @@ def _show_table(
         tests = {name: test for name, test in tests.items() if any(part in name for part in only)}
     report = play(
         config,
-        [find_contender(name, beside) for name in names],
+        find_contenders(names, beside),
         tests,
         workers or os.cpu_count() or 1,
         lambda who, test, _: typer.echo(f"{who}: {test}", err=True),
@@ -244,10 +244,10 @@ def _write_page(
 ) -> None:
     from training import figures
     from training.checkpoint import RunFolder
-    from training.contest import Contest, find_contender
+    from training.contest import Contest, find_contenders
     from training.reference import make_reference
 
-    contenders = [find_contender(name, beside) for name in names]
+    contenders = find_contenders(names, beside)
     first, recorder = contenders[0], figures.Recorder(config)
     drawn = {
         "Fig. 4: on flat ground": figures.figure_4(recorder, contenders, make_reference(config)),
