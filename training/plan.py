@@ -85,11 +85,11 @@ POLISH = msgspec.structs.replace(
 REFINE = msgspec.structs.replace(
     POLISH, name="refine", learning_rate=0.015, learning_rate_end=0.0015, weight_decay=0.05
 )
-"""From numbers that already walk: smaller steps, or what they know is lost before anything is learnt."""
-ROUGHEN = StagePlan(
-    name="roughen", reward="task", iterations=40, directions=48, ticks=700, conditions="rough", symmetry="both",
-    stdev=0.05, stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.003, fall_weight=2.5,
-)  # fmt: skip
+"""From numbers that already walk."""
+ROUGHEN = msgspec.structs.replace(
+    POLISH, name="roughen", iterations=40, ticks=700, conditions="rough", learning_rate_end=0.003
+)
+"""The same on uneven ground, which takes longer to cross."""
 PAPER = StagePlan(name="imitate", reward="table", iterations=60, conditions="imitation", symmetry="none")
 """Section IV.B: 64 directions, 1000 ticks, 60 iterations; with the sensors' noise, without which nothing transfers."""
 
