@@ -12,9 +12,11 @@ from drivers.robot import Array
 from runtime import config as configuration
 from runtime import policies
 from runtime.control.policy import encode_policy
+from sim.terrain import HeightField, Plane, Slope
 from training import pgpe, selection
 from training.checkpoint import Checkpoint, Row, RunFolder
 from training.contest import Contender, Outcome, Trial
+from training.randomize import ROUGH
 from training.variants import VARIANTS, make_policy, with_parameters
 
 CONFIG = configuration.load(configuration.find_robot("stoch3"))
@@ -83,3 +85,11 @@ def test_one_checkpoint_that_is_better_than_the_mean_is_kept(tmp_path: Path) -> 
 def test_a_run_of_one_checkpoint_keeps_it(tmp_path: Path) -> None:
     parameters, _ = selected(run_of(tmp_path, [BEST]))
     assert parameters == pytest.approx(BEST)
+
+
+def test_what_was_trained_on_uneven_ground_is_judged_there() -> None:
+    _, level = selection.validation_set()
+    _, uneven = selection.validation_set(bounds=ROUGH)
+    assert {type(trial.conditions.scenario.terrain) for trial in level} == {Plane}
+    assert {type(trial.conditions.scenario.terrain) for trial in uneven} == {Plane, Slope, HeightField}
+    assert len(level) == len(uneven)

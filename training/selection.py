@@ -15,7 +15,7 @@ from runtime.control.policy import Policy, encode_policy
 from sim.scenario import Push, Scenario
 from training.checkpoint import RunFolder, write_whole
 from training.contest import Contender, Contest, Outcome, Trial
-from training.randomize import SENSORS, TASK, Conditions, draw
+from training.randomize import SENSORS, TASK, Conditions, Randomization, draw
 from training.variants import with_parameters
 
 CANDIDATES = 4
@@ -42,8 +42,8 @@ class Verdict:
         return self.task_return - 50.0 * self.falls - 1000.0 * self.error
 
 
-def validation_set(draws: int = 24) -> tuple[list[Trial], list[Trial]]:
-    """Velocities that are measured, and pushes, spawns and draws that are to be survived."""
+def validation_set(draws: int = 24, bounds: Randomization = TASK) -> tuple[list[Trial], list[Trial]]:
+    """Velocities that are measured on level ground, and pushes, spawns and draws that are to be survived."""
     commands = ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (-0.4, 0.0, 0.0), (1.6, 0.0, 0.0), (0.0, 0.3, 0.0), (0.5, 0.0, 0.5))
     measured = [Trial(Conditions(Scenario(seed=VALIDATION_SEED, noise=SENSORS), command), 5.0) for command in commands]
     pushed = [
@@ -62,12 +62,12 @@ def validation_set(draws: int = 24) -> tuple[list[Trial], list[Trial]]:
         for side in (0.0, pi / 2, pi, -pi / 2)
     ]
     rng = np.random.default_rng(VALIDATION_SEED)
-    return measured, pushed + [Trial(draw(TASK, rng), 2.6) for _ in range(draws)]
+    return measured, pushed + [Trial(draw(bounds, rng), 2.6) for _ in range(draws)]
 
 
-def judge(contest: Contest, who: Contender, iteration: int, averaged: int = 1) -> Verdict:
-    """One candidate."""
-    measured, survived = validation_set()
+def judge(contest: Contest, who: Contender, iteration: int, averaged: int = 1, bounds: Randomization = TASK) -> Verdict:
+    """One candidate; ``bounds`` of the draws."""
+    measured, survived = validation_set(bounds=bounds)
     walks = contest.play(who, measured)
     rest: list[Outcome] = contest.play(who, survived)
     wanted = np.array([trial.conditions.command for trial in measured])
@@ -81,8 +81,13 @@ def judge(contest: Contest, who: Contender, iteration: int, averaged: int = 1) -
     )
 
 
-def select(config: Config, folder: RunFolder, workers: int, say: Callable[[str], None]) -> Policy:
-    """The best of the last stage's checkpoints and their mean, with the verdicts in its provenance."""
+def select(
+    config: Config, folder: RunFolder, workers: int, say: Callable[[str], None], bounds: Randomization = TASK
+) -> Policy:
+    """The best of the last stage's checkpoints and their mean, with the verdicts in its provenance.
+
+    ``bounds`` of the draws that judge: those of the ground that it was trained for.
+    """
     numbers = folder.iterations()
     last_stage = [row.iteration for row in folder.curve() if row.stage == folder.curve()[-1].stage]
     last = [number for number in numbers if number in last_stage] or numbers
@@ -95,7 +100,7 @@ def select(config: Config, folder: RunFolder, workers: int, say: Callable[[str],
     verdicts: list[Verdict] = []
     with Contest(config, workers) as contest:
         for path, number, averaged in candidates:
-            verdicts.append(judge(contest, Contender(path.stem, "policy", str(path)), number, averaged))
+            verdicts.append(judge(contest, Contender(path.stem, "policy", str(path)), number, averaged, bounds))
             say(f"validation of {path.stem}: {msgspec.to_builtins(verdicts[-1])}, score {verdicts[-1].score:.0f}")
     best = max(range(len(verdicts)), key=lambda place: verdicts[place].score)
     policy = policies.load(candidates[best][0], config.robot.name)

@@ -176,17 +176,22 @@ def _finish(config: Config, folder: RunFolder, trainer: Trainer, end: Checkpoint
     """Choose the best checkpoint on the validation set, write the policy, show the table."""
     from runtime.control.policy import encode_policy
     from training.checkpoint import write_whole
+    from training.randomize import ROUGH, TASK
 
     policy = trainer.policy(end)
+    rough = trainer.plan.stages[-1].conditions == "rough"
     if validate:
         from training.selection import select
 
-        policy = select(config, folder, workers or os.cpu_count() or 1, lambda text: typer.echo(text, err=True))
+        policy = select(
+            config, folder, workers or os.cpu_count() or 1, lambda text: typer.echo(text, err=True),
+            ROUGH if rough else TASK,
+        )  # fmt: skip
     target = folder.path / f"{policy.name}.json"
     write_whole(target, encode_policy(policy))
     typer.echo(f"policy: {target}")
     if validate:
-        _show_table(config, [str(target), "mpc", "mpc-tuned", config.control.policy], workers, quick=True)
+        _show_table(config, [str(target), "mpc", "mpc-tuned", config.control.policy], workers, quick=True, rough=rough)
 
 
 def evaluate(
