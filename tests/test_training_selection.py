@@ -16,7 +16,7 @@ from sim.terrain import HeightField, Plane, Slope
 from training import pgpe, selection
 from training.checkpoint import Checkpoint, Row, RunFolder
 from training.contest import Contender, Outcome, Trial
-from training.randomize import ROUGH
+from training.plan import IMITATE, REFINE, ROUGHEN, StagePlan
 from training.variants import VARIANTS, make_policy, with_parameters
 
 CONFIG = configuration.load(configuration.find_robot("stoch3"))
@@ -58,8 +58,8 @@ def _nearness(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selection, "Contest", NearnessContest)
 
 
-def selected(folder: RunFolder) -> tuple[Array, dict[str, object]]:
-    policy = selection.select(CONFIG, folder, 1, lambda _: None)
+def selected(folder: RunFolder, stage: StagePlan = REFINE) -> tuple[Array, dict[str, object]]:
+    policy = selection.select(CONFIG, folder, stage, 1, lambda _: None)
     return policy.parameters, policy.provenance
 
 
@@ -87,9 +87,19 @@ def test_a_run_of_one_checkpoint_keeps_it(tmp_path: Path) -> None:
     assert parameters == pytest.approx(BEST)
 
 
-def test_what_was_trained_on_uneven_ground_is_judged_there() -> None:
-    _, level = selection.validation_set()
-    _, uneven = selection.validation_set(bounds=ROUGH)
-    assert {type(trial.conditions.scenario.terrain) for trial in level} == {Plane}
-    assert {type(trial.conditions.scenario.terrain) for trial in uneven} == {Plane, Slope, HeightField}
-    assert len(level) == len(uneven)
+@pytest.mark.parametrize(
+    ("stage", "grounds"), [(IMITATE, {Plane}), (REFINE, {Plane}), (ROUGHEN, {Plane, Slope, HeightField})]
+)
+def test_the_ground_that_was_trained_on_judges(
+    stage: StagePlan, grounds: set[type], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played: list[Trial] = []
+
+    class WatchedContest(NearnessContest):
+        def play(self, who: Contender, trials: Sequence[Trial]) -> list[Outcome]:
+            played.extend(trials)
+            return super().play(who, trials)
+
+    monkeypatch.setattr(selection, "Contest", WatchedContest)
+    selected(run_of(tmp_path, [BEST]), stage)
+    assert {type(trial.conditions.scenario.terrain) for trial in played} == grounds

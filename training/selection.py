@@ -15,11 +15,14 @@ from runtime.control.policy import Policy, encode_policy
 from sim.scenario import Push, Scenario
 from training.checkpoint import RunFolder, write_whole
 from training.contest import Contender, Contest, Outcome, Trial
-from training.randomize import SENSORS, TASK, Conditions, Randomization, draw
+from training.plan import StagePlan
+from training.randomize import SENSORS, SETS, TASK, Conditions, Randomization, draw
 from training.variants import with_parameters
 
 CANDIDATES = 4
 """Checkpoints that are compared: the last ones, evenly spread over the last stage."""
+DRAWS = 24
+"""Episodes drawn at random, beside the measured walks and the pushes."""
 VALIDATION_SEED = 5_000
 """Of the episodes that judge; apart from training's and from the table's."""
 
@@ -42,7 +45,7 @@ class Verdict:
         return self.task_return - 50.0 * self.falls - 1000.0 * self.error
 
 
-def validation_set(draws: int = 24, bounds: Randomization = TASK) -> tuple[list[Trial], list[Trial]]:
+def validation_set(bounds: Randomization = TASK) -> tuple[list[Trial], list[Trial]]:
     """Velocities that are measured on level ground, and pushes, spawns and draws that are to be survived."""
     commands = ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (-0.4, 0.0, 0.0), (1.6, 0.0, 0.0), (0.0, 0.3, 0.0), (0.5, 0.0, 0.5))
     measured = [Trial(Conditions(Scenario(seed=VALIDATION_SEED, noise=SENSORS), command), 5.0) for command in commands]
@@ -62,12 +65,12 @@ def validation_set(draws: int = 24, bounds: Randomization = TASK) -> tuple[list[
         for side in (0.0, pi / 2, pi, -pi / 2)
     ]
     rng = np.random.default_rng(VALIDATION_SEED)
-    return measured, pushed + [Trial(draw(bounds, rng), 2.6) for _ in range(draws)]
+    return measured, pushed + [Trial(draw(bounds, rng), 2.6) for _ in range(DRAWS)]
 
 
 def judge(contest: Contest, who: Contender, iteration: int, averaged: int = 1, bounds: Randomization = TASK) -> Verdict:
     """One candidate; ``bounds`` of the draws."""
-    measured, survived = validation_set(bounds=bounds)
+    measured, survived = validation_set(bounds)
     walks = contest.play(who, measured)
     rest: list[Outcome] = contest.play(who, survived)
     wanted = np.array([trial.conditions.command for trial in measured])
@@ -81,13 +84,13 @@ def judge(contest: Contest, who: Contender, iteration: int, averaged: int = 1, b
     )
 
 
-def select(
-    config: Config, folder: RunFolder, workers: int, say: Callable[[str], None], bounds: Randomization = TASK
-) -> Policy:
+def select(config: Config, folder: RunFolder, stage: StagePlan, workers: int, say: Callable[[str], None]) -> Policy:
     """The best of the last stage's checkpoints and their mean, with the verdicts in its provenance.
 
-    ``bounds`` of the draws that judge: those of the ground that it was trained for.
+    ``stage``, the last, tells what draws judge: its own where it serves a task, so that uneven ground judges what was
+    trained on it.
     """
+    bounds = SETS[stage.conditions] if stage.reward == "task" else TASK
     numbers = folder.iterations()
     last_stage = [row.iteration for row in folder.curve() if row.stage == folder.curve()[-1].stage]
     last = [number for number in numbers if number in last_stage] or numbers

@@ -81,7 +81,7 @@ def _play(stage: Stage, ticks: int, tasks: Sequence[Task]) -> list[tuple[float, 
 
 
 def judging_tasks(parameters: np.ndarray) -> list[Task]:
-    """Spawns tilted by up to 0.2 rad, friction, noise and sensors' biases that training never saw."""
+    """Spawns tilted by up to 0.2 rad, friction, noise and sensors' biases, of a seed that no training draws from."""
     rng = np.random.default_rng(VALIDATION_SEED)
     return [Task(parameters, draw(IMITATION, rng)) for _ in range(DRAWS)]
 

@@ -176,22 +176,20 @@ def _finish(config: Config, folder: RunFolder, trainer: Trainer, end: Checkpoint
     """Choose the best checkpoint on the validation set, write the policy, show the table."""
     from runtime.control.policy import encode_policy
     from training.checkpoint import write_whole
-    from training.randomize import ROUGH, TASK
 
     policy = trainer.policy(end)
-    rough = trainer.plan.stages[-1].conditions == "rough"
+    last = trainer.plan.stages[-1]
     if validate:
         from training.selection import select
 
-        policy = select(
-            config, folder, workers or os.cpu_count() or 1, lambda text: typer.echo(text, err=True),
-            ROUGH if rough else TASK,
-        )  # fmt: skip
+        count = workers or os.cpu_count() or 1
+        policy = select(config, folder, last, count, lambda text: typer.echo(text, err=True))
     target = folder.path / f"{policy.name}.json"
     write_whole(target, encode_policy(policy))
     typer.echo(f"policy: {target}")
     if validate:
-        _show_table(config, [str(target), "mpc", "mpc-tuned", config.control.policy], workers, quick=True, rough=rough)
+        names = [str(target), "mpc", "mpc-tuned", config.control.policy]
+        _show_table(config, names, workers, quick=True, rough=last.conditions == "rough")
 
 
 def evaluate(
