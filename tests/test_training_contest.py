@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,19 @@ from runtime.policies import PolicyError, find_policy
 from sim.scenario import Push, Scenario
 from sim.world import World
 from training import table
-from training.contest import BUILT_IN, Contender, Outcome, Trial, find_contender, find_contenders, run_trial
+from training.contest import (
+    BUILT_IN,
+    Contender,
+    Outcome,
+    Trial,
+    ablated,
+    find_contender,
+    find_contenders,
+    run_trial,
+)
 from training.evaluation import Report
 from training.mpc_controller import MpcController, centre_state, put_forces
+from training.plan import make_plan
 from training.randomize import SENSORS, Conditions
 from training.robot_reference import record_reference
 from training.rollout import walk
@@ -35,6 +46,33 @@ def test_every_built_in_contender_follows_a_command(name: str, world: World) -> 
     assert not outcome.fell
     assert outcome.velocity == pytest.approx((0.5, 0.0, 0.0), abs=0.08)
     assert outcome.height == pytest.approx(CONFIG.control.gait.walking_height, abs=0.03)
+
+
+@pytest.mark.parametrize("name", ["mpc", "mpc-tuned", "balance"])
+def test_every_built_in_contender_stands(name: str, world: World) -> None:
+    walker = find_contender(name).walker(CONFIG)
+    stances = []
+
+    def watch(tick: int, _: object) -> bool:
+        stances.append(walker.record["stance"][0].copy())
+        return True
+
+    conditions = Conditions(Scenario(noise=SENSORS), (0.0, 0.0, 0.0), standing=True)
+    _, fell = walk(world, walker, conditions, np.zeros((300, 3)), watch)
+    assert not fell and np.all(stances)
+    assert world.truth.position[2] == pytest.approx(CONFIG.control.gait.walking_height, abs=0.01)
+
+
+def test_the_table_says_how_far_from_its_height_a_contender_stands() -> None:
+    class Low:
+        walking_height = 0.5
+
+        def play(self, who: Contender, trials: Sequence[Trial]) -> list[Outcome]:
+            assert all(trial.conditions.standing for trial in trials)
+            return [replace(outcome(False), height=0.5 + error) for error in (0.001, -0.022, 0.004)]
+
+    cells = table._stand(Low(), Contender("x", "zero"), table.FULL)  # type: ignore[arg-type]
+    assert cells == {"height error mm": pytest.approx(22.0), "falls": 0.0}
 
 
 def test_the_teacher_turns_and_sidesteps(world: World) -> None:
@@ -114,6 +152,27 @@ def test_policies_that_are_called_alike_keep_a_column_each(tmp_path: Path) -> No
     mine.write_bytes(find_policy("balance").read_bytes())
     names = [contender.name for contender in find_contenders([str(mine), "mpc", "trot", "mpc", "balance"])]
     assert names == [str(mine), "mpc", "trot", "balance"]
+
+
+def test_a_policy_walks_without_a_fixed_term(world: World) -> None:
+    trot = find_contender("trot")
+    columns = ablated(trot, ["slope", "velocity_integral"])
+    assert [one.name for one in columns] == ["no velocity_integral", "no slope"]
+    trial = Trial(Conditions(Scenario(), (0.8, 0.0, 0.0)), 6.0)
+    whole, without = (run_trial(CONFIG, world, one.walker(CONFIG), trial).velocity[0] for one in (trot, columns[0]))
+    assert abs(whole - 0.8) < 0.01 < 0.03 < abs(without - 0.8)
+    assert [one.name for one in ablated(trot, ["all"])][-1] == "no term"
+    assert ablated(trot, ["all"])[-1].walker(CONFIG).policy.terms.capture_point == 0.0  # type: ignore[attr-defined]
+    assert ablated(find_contender("mpc"), ()) == []
+
+
+def test_a_term_that_is_none_or_of_no_policy_is_refused() -> None:
+    with pytest.raises(PolicyError, match=r"no fixed term 'speed': there are velocity_integral, .*slope"):
+        ablated(find_contender("trot"), ["speed"])
+    with pytest.raises(PolicyError, match="mpc is no policy file"):
+        ablated(find_contender("mpc"), ["slope"])
+    with pytest.raises(PolicyError, match="no fixed term 'speed'"):
+        make_plan("tried", "stoch3", "0" * 16, 1, "linear", "", False, False, without=["speed"])
 
 
 class Threshold:

@@ -15,7 +15,7 @@ from runtime.control.policy import Policy, balance_policy
 from sim.scenario import Push, Scenario
 from training import evaluators
 from training.evaluators import InProcess, Processes
-from training.randomize import IMITATION, NOMINAL, ROUGH, TASK, Conditions, Randomization, draw
+from training.randomize import IMITATION, NOMINAL, ROUGH, STANDING_PUSH, TASK, WIDE, Conditions, Randomization, draw
 from training.reference import make_reference
 from training.reward import TableReward, TaskReward
 from training.rollout import Episode, Setup, Stage, Task
@@ -72,6 +72,21 @@ def test_draws_stay_inside_their_bounds_and_use_them() -> None:
     commands = np.array([one.command for one in drawn])
     assert commands[:, 0].min() >= -0.6 and commands[:, 0].max() <= 1.6
     assert 0.15 < (commands == 0).mean() < 0.35
+
+
+def test_some_episodes_stand_and_some_motors_are_weak() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [draw(WIDE, rng) for _ in range(600)]
+    standing = [one for one in drawn if one.standing]
+    assert 0.08 < len(standing) / len(drawn) < 0.16
+    assert {one.command for one in standing} == {(0.0, 0.0, 0.0)}
+    pushes = [push for one in standing for push in one.scenario.pushes]
+    hardest = max(np.hypot(*push.force[:2]) * push.duration for push in pushes)
+    assert 0.9 * STANDING_PUSH * 50 < hardest <= STANDING_PUSH * 50
+    strengths = np.array([one.scenario.motor_strength for one in drawn])
+    weak = strengths[strengths < 1.0]
+    assert 0.2 < weak.size / strengths.size < 0.3
+    assert weak.min() < 0.46 and weak.max() > 0.95
 
 
 def test_nominal_conditions_are_the_worlds_own() -> None:

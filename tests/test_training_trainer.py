@@ -13,6 +13,7 @@ from drivers.robot import Array
 from runtime import config as configuration
 from runtime import policies
 from runtime.config import Config
+from runtime.control.policy import BALANCE_TERMS
 from training import checkpoint as checkpoints
 from training.checkpoint import Row, RunError, RunFolder
 from training.plan import RunPlan, StagePlan
@@ -256,3 +257,9 @@ def test_the_papers_letter_has_no_fixed_terms(config: Config) -> None:
     assert set(msgspec.structs.astuple(policy.terms)) >= {0.0}
     assert policy.terms.capture_point == policy.terms.velocity_integral == policy.terms.centripetal == 0.0
     assert policy.parameters.size == 504
+
+
+def test_a_run_without_a_term_makes_policies_without_it(tmp_path: Path, config: Config, reference: Reference) -> None:
+    made = msgspec.structs.replace(plan(config), without=("capture_point",))
+    trainer = begin(config, reference, tmp_path / "run", made)
+    assert trainer.policy(trainer.start()).terms == msgspec.structs.replace(BALANCE_TERMS, capture_point=0.0)

@@ -19,6 +19,7 @@ from runtime.config import Config
 from runtime.control.controller import Controller
 from runtime.control.policy import balance_policy
 from runtime.control.records import Records, VelocityCommand
+from runtime.policies import PolicyError
 from sim.scenario import Scenario
 from sim.world import World
 from training.mpc_controller import MpcController
@@ -26,7 +27,7 @@ from training.randomize import Conditions
 from training.reward import TASK_TERMS, TaskReward
 from training.rollout import LOWEST, Walker, walk
 from training.score import score_task
-from training.variants import Variant, make_policy, with_parameters
+from training.variants import TERMS, Term, Variant, find_terms, make_policy, with_parameters, without_terms
 
 BUILT_IN = ("mpc", "mpc-tuned", "zero", "balance")
 SETTLE = 2.0
@@ -41,6 +42,8 @@ class Contender:
     name: str
     kind: Kind
     path: str = ""
+    without: tuple[Term, ...] = ()
+    """Fixed terms of the policy file that are off."""
 
     def walker(self, config: Config) -> Walker:
         """Its controller, new."""
@@ -48,7 +51,7 @@ class Contender:
         if self.kind in ("mpc", "mpc-tuned"):
             return MpcController(config, terms=self.kind == "mpc-tuned")
         if self.kind == "policy":
-            policy = policies.load(Path(self.path), config.robot.name)
+            policy = without_terms(policies.load(Path(self.path), config.robot.name), self.without)
         elif self.kind == "balance":
             policy = balance_policy(config.robot, height)
         else:
@@ -80,6 +83,19 @@ def find_contenders(names: Sequence[str], beside: Path | None = None) -> list[Co
         found.setdefault(find_contender(name, beside), name)
     count = Counter(contender.name for contender in found)
     return [replace(one, name=asked) if count[one.name] > 1 else one for one, asked in found.items()]
+
+
+def ablated(contender: Contender, terms: Sequence[str]) -> list[Contender]:
+    """The contender once without each of ``terms``; "all" stands for one column each and one without any.
+
+    Raises:
+        PolicyError: no such term, or the contender is no policy file.
+    """
+    if terms and contender.kind != "policy":
+        raise PolicyError(f"{contender.name} is no policy file: only those have terms that can be off")
+    each = TERMS if "all" in terms else find_terms(terms)
+    alone = [replace(contender, name=f"no {name}", without=(name,)) for name in each]
+    return [*alone, replace(contender, name="no term", without=TERMS)] if "all" in terms else alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,10 +153,10 @@ class _Timed:
         self.geometry: Records = walker.geometry
         self.reset = walker.reset
 
-    def step(self, measurement: Measurement, command: VelocityCommand) -> JointCommand:
+    def step(self, measurement: Measurement, command: VelocityCommand, standing: bool = False) -> JointCommand:
         """One tick, timed."""
         began = time.perf_counter()
-        answer = self._walker.step(measurement, command)
+        answer = self._walker.step(measurement, command, standing)
         self._times.append(time.perf_counter() - began)
         return answer
 
@@ -242,6 +258,8 @@ class Contest:
     """Worker processes that play (contender, trial) pairs; ``with`` lets them go."""
 
     def __init__(self, config: Config, workers: int) -> None:
+        self.walking_height = config.control.gait.walking_height
+        """What the body's height is judged by, m."""
         self._pool = ProcessPoolExecutor(workers, get_context("spawn"), _enter, (config,))
 
     def __enter__(self) -> Contest:

@@ -73,7 +73,7 @@ class WalkEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         asked = (options or {}).get("command", conditions.command or (0.0, 0.0, 0.0))
         self._asked: Array = np.array(asked, dtype=np.float64)
         self._command = VelocityCommand(linear=self._asked[:2], yaw_rate=float(self._asked[2]))
-        self._ground = conditions.scenario.terrain
+        self._ground, self._standing = conditions.scenario.terrain, conditions.standing
         self._smoothed, self._tick = np.zeros(3), 0
         measurement = self._world.reset(conditions.scenario)
         self._controller.reset(measurement)
@@ -84,7 +84,7 @@ class WalkEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Answer the last observation with ``action`` (18,) in scaled units, and live for one tick."""
         controller = self._controller
         self._answer(np.asarray(action, dtype=np.float64))
-        command = controller.step(self._measurement, self._command)
+        command = controller.step(self._measurement, self._command, self._standing)
         failed = controller.record["solver_status"][0] == SolverStatus.FAILED
         self._measurement = self._world.step(command)
         terms, upright = self._score()
@@ -100,7 +100,7 @@ class WalkEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """What the policy will see of the last measurement; the controller is as before."""
         state, record = self._controller.state, self._controller.record
         kept = state.copy(), record.copy()
-        self._controller.step(self._measurement, self._command)
+        self._controller.step(self._measurement, self._command, self._standing)
         self._seen: Array = record["observation"][0].copy()
         state[:], record[:] = kept
         return np.asarray(np.clip(self._seen, -LIMIT, LIMIT), dtype=np.float32)

@@ -62,15 +62,15 @@ class MpcController:
         self._core.reset(measurement)
         self._forget()
 
-    def step(self, measurement: Measurement, command: VelocityCommand) -> JointCommand:
+    def step(self, measurement: Measurement, command: VelocityCommand, standing: bool = False) -> JointCommand:
         """One tick. ``solver_status`` is ``FAILED`` where the teacher has no answer."""
-        asked = self._core.step(measurement, command)
+        asked = self._core.step(measurement, command, standing)
         t = self.record[0]
         self._follow(t["velocity_command"], float(t["rpy"][2]))
         stance = t["stance"].astype(np.bool_)
         if self._tick % self._every == 0 or (stance != self._stance).any():
             try:
-                self._forces = solve_mpc(self._look_ahead(stance), self._body, self._mpc)[0]
+                self._forces = solve_mpc(self._look_ahead(stance, standing), self._body, self._mpc)[0]
             except MpcError:
                 t["solver_status"] = SolverStatus.FAILED
         self._tick += 1
@@ -95,8 +95,11 @@ class MpcController:
         ahead = self._wanted - here
         self._wanted = here + ahead * min(1.0, LEASH / max(float(np.hypot(*ahead)), 1e-9))
 
-    def _look_ahead(self, stance_now: Array) -> Horizon:
-        """The problem in the heading frame of this moment, its origin on the ground under the body."""
+    def _look_ahead(self, stance_now: Array, standing: bool) -> Horizon:
+        """The problem in the heading frame of this moment, its origin on the ground under the body.
+
+        Who stands keeps on the ground what stands there.
+        """
         t, s, p = self.record[0], self._core.state[0], self._core.parameters[0]
         yaw = float(t["rpy"][2])
         state = centre_state(t["rpy"], t["height"], t["twist"], self._body.com)
@@ -112,6 +115,8 @@ class MpcController:
             p, float(s["clock"]), stance_now, feet_now, t["touchdown"], np.zeros(3), 0.0, commands[0], self._mpc.dt,
             feet, stance,
         )  # fmt: skip
+        if standing:
+            feet[:], stance[:] = feet_now, stance_now
         return Horizon(state, path, expected, feet, stance)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
 from drivers.description import Name, NonNegative, Positive, Record
+from training.variants import Term, find_terms
 
 Count = Annotated[int, Meta(ge=1)]
 PHYSICS_RATE_HZ = 600.0
@@ -23,7 +25,7 @@ class StagePlan(Record, frozen=True, kw_only=True):
     iterations: Count
     directions: Count = 64
     ticks: Count = 1000
-    conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "rough"] = "imitation"
+    conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "wide", "rough"] = "imitation"
     """Bounds of the draws: ``training.randomize.SETS``."""
     symmetry: Literal["none", "left-right", "both"] = "left-right"
     stdev: Positive = 0.1
@@ -48,6 +50,8 @@ class RunPlan(Record, frozen=True, kw_only=True):
     variant: Literal["linear", "linear-plain", "linear-grf", "mlp", "mlp-plain", "mlp-grf"] = "linear"
     terms: bool = True
     """The fixed terms around the matrix (method: Past the teacher); off is the paper's letter."""
+    without: tuple[Term, ...] = ()
+    """Fixed terms that are off all the same."""
     reference: Literal["rigid-body", "robot"] = "rigid-body"
     physics_rate_hz: Positive = PHYSICS_RATE_HZ
     start: str = ""
@@ -74,11 +78,12 @@ SERVE = StagePlan(
 )  # fmt: skip
 """From a walk to one that follows commands and takes pushes."""
 SHED = msgspec.structs.replace(
-    SERVE, name="shed", iterations=60, learning_rate=0.03, learning_rate_end=0.003, fall_weight=8.0, weight_decay=1.0
-)
+    SERVE, name="shed", iterations=60, conditions="wide", learning_rate=0.03, learning_rate_end=0.003, fall_weight=8.0,
+    weight_decay=1.0,
+)  # fmt: skip
 """Numbers that grew while nothing asked for them make a robot fall that is pushed hard: they fade here."""
 POLISH = msgspec.structs.replace(
-    SERVE, name="polish", iterations=100, directions=64, stdev=0.04, learning_rate=0.02, learning_rate_end=0.002,
+    SERVE, name="polish", iterations=180, directions=64, stdev=0.04, learning_rate=0.02, learning_rate_end=0.001,
     fall_weight=5.0, weight_decay=0.1,
 )  # fmt: skip
 """What was shed is won back, where it serves."""
@@ -104,6 +109,7 @@ def make_plan(
     paper: bool,
     rough: bool,
     reference: str = "rigid-body",
+    without: Sequence[str] = (),
 ) -> RunPlan:
     """The plan of a ``trotd train`` from nothing, from a policy's numbers, by the paper's letter or on rough ground."""
     stages: tuple[StagePlan, ...] = (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, SHED, POLISH)
@@ -114,7 +120,7 @@ def make_plan(
     return msgspec.convert(
         {
             "name": name, "robot": robot, "config": config, "seed": seed, "variant": variant, "terms": not paper,
-            "start": start, "reference": reference, "stages": stages,
+            "start": start, "reference": reference, "stages": stages, "without": find_terms(without),
         },
         RunPlan,
     )  # fmt: skip

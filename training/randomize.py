@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, pi, sin
 
 import numpy as np
@@ -28,6 +28,8 @@ class Conditions:
     scenario: Scenario
     command: tuple[float, float, float] | None = None
     """vx, vy m/s and yaw rate rad/s of the whole episode; None follows the reference's."""
+    standing: bool = False
+    """All four feet stay down, as in the mode of that name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,8 @@ class Randomization:
     payload: Range = (0.0, 0.0)
     """kg."""
     motor_strength: Range = (1.0, 1.0)
+    weak_share: float = 1.0
+    """Share of the episodes whose motors' strength is drawn; the others' is whole."""
     extra_delay: Range = (0.0, 0.0)
     """s."""
     velocity_x: Range | None = None
@@ -65,8 +69,12 @@ class Randomization:
     """± rad/s."""
     zeroed_axes: float = 0.0
     """Probability with which each axis of the command is zero."""
+    standing_share: float = 0.0
+    """Share of the episodes in which it stands; a push of those is ``STANDING_PUSH`` of what was drawn."""
 
 
+STANDING_PUSH = 0.4
+"""Four feet that may not step hold so much of a push that a walk takes."""
 NOMINAL = Randomization()
 PAPER = Randomization(tilt=pi / 6, friction=(0.8, 1.2))
 """Section IV.C, with the mirrored signs."""
@@ -78,30 +86,50 @@ TASK = Randomization(
     velocity_x=(-0.6, 1.6), velocity_y=0.4, yaw_rate=1.0, zeroed_axes=0.25,
 )  # fmt: skip
 """The second stage, from the method's page."""
+WIDE = replace(TASK, standing_share=0.12, weak_share=0.25, motor_strength=(0.42, 1.0), push_impulse=(10.0, 50.0))
+"""The task, standing, and motors that give less than they should."""
 ROUGH = Randomization(
     tilt=0.2, friction=(0.6, 1.2), noise=True, push_probability=0.4, push_impulse=(10.0, 35.0), push_time=(0.6, 2.5),
     bump=0.08, slope=0.2, level_share=0.2, velocity_x=(-0.3, 1.0), velocity_y=0.3, yaw_rate=0.8, zeroed_axes=0.25,
 )  # fmt: skip
 """Fine-tuning on height fields, beyond the paper's ±5 cm."""
-SETS = {"nominal": NOMINAL, "paper": PAPER, "noisy": NOISY, "imitation": IMITATION, "task": TASK, "rough": ROUGH}
+SETS = {
+    "nominal": NOMINAL,
+    "paper": PAPER,
+    "noisy": NOISY,
+    "imitation": IMITATION,
+    "task": TASK,
+    "wide": WIDE,
+    "rough": ROUGH,
+}
 
 
 def draw(bounds: Randomization, rng: np.random.Generator) -> Conditions:
     """One episode's conditions. The same generator state gives the same ones, on any machine."""
-    return Conditions(
-        Scenario(
-            seed=int(rng.integers(2**31)),
-            rpy=(_signed(rng, bounds.tilt), _signed(rng, bounds.tilt), _signed(rng, bounds.tilt)),
-            friction=_within(rng, bounds.friction),
-            terrain=_draw_terrain(bounds, rng),
-            pushes=_draw_pushes(bounds, rng),
-            payload=_within(rng, bounds.payload),
-            motor_strength=_within(rng, bounds.motor_strength),
-            extra_delay=_within(rng, bounds.extra_delay),
-            noise=SENSORS if bounds.noise else Noise(),
-        ),
-        _draw_command(bounds, rng),
+    scenario = Scenario(
+        seed=int(rng.integers(2**31)),
+        rpy=(_signed(rng, bounds.tilt), _signed(rng, bounds.tilt), _signed(rng, bounds.tilt)),
+        friction=_within(rng, bounds.friction),
+        terrain=_draw_terrain(bounds, rng),
+        pushes=_draw_pushes(bounds, rng),
+        payload=_within(rng, bounds.payload),
+        motor_strength=_within(rng, bounds.motor_strength),
+        extra_delay=_within(rng, bounds.extra_delay),
+        noise=SENSORS if bounds.noise else Noise(),
     )
+    command = _draw_command(bounds, rng)
+    if bounds.weak_share < 1.0 and rng.random() >= bounds.weak_share:
+        scenario = replace(scenario, motor_strength=1.0)
+    if bounds.standing_share > 0.0 and rng.random() < bounds.standing_share:
+        return Conditions(replace(scenario, pushes=_softened(scenario.pushes)), (0.0, 0.0, 0.0), standing=True)
+    return Conditions(scenario, command)
+
+
+def _softened(pushes: tuple[Push, ...]) -> tuple[Push, ...]:
+    def softer(force: tuple[float, float, float]) -> tuple[float, float, float]:
+        return STANDING_PUSH * force[0], STANDING_PUSH * force[1], STANDING_PUSH * force[2]
+
+    return tuple(replace(push, force=softer(push.force)) for push in pushes)
 
 
 def _draw_terrain(bounds: Randomization, rng: np.random.Generator) -> Terrain:

@@ -74,8 +74,8 @@ class Walker(Protocol):
     def reset(self, measurement: Measurement) -> None:
         """Forget everything."""
 
-    def step(self, measurement: Measurement, command: VelocityCommand) -> JointCommand:
-        """One tick."""
+    def step(self, measurement: Measurement, command: VelocityCommand, standing: bool = False) -> JointCommand:
+        """One tick; ``standing`` begins no new swing."""
 
 
 Watch = Callable[[int, Array], bool]
@@ -99,7 +99,7 @@ def walk(world: World, walker: Walker, conditions: Conditions, commands: Array, 
         measurement = world.step(command)
         if changed:
             asked = VelocityCommand(linear=wanted[:2], yaw_rate=float(wanted[2]))
-        command = walker.step(measurement, asked)
+        command = walker.step(measurement, asked, conditions.standing)
         if status[0] == failed or (tick % FALL_CHECK == 0 and world.fallen()):
             return tick, True
         if not watch(tick, wanted):

@@ -50,6 +50,7 @@ def make_tests(size: Size) -> dict[str, Test]:
     return {
         "velocity, noisy": lambda contest, who: _grid(contest, who, size, SENSORS),
         "velocity, clean": lambda contest, who: _grid(contest, who, size, Noise()),
+        "standing": lambda contest, who: _stand(contest, who, size),
         "forward 2.0 m/s": lambda contest, who: _survive(contest, who, _same(_noisy(0), (2.0, 0.0, 0.0), size.walk)),
         "push sideways": lambda contest, who: _push(contest, who, size, pi / 2),
         "push forward": lambda contest, who: _push(contest, who, size, 0.0),
@@ -113,6 +114,13 @@ def _grid(contest: Contest, who: Contender, size: Size, noise: Noise) -> Cells:
         "falls": float(sum(outcome.fell for outcome in outcomes)),
         "step µs": float(np.median([outcome.compute for outcome in outcomes])) * 1e6,
     }
+
+
+def _stand(contest: Contest, who: Contender, size: Size) -> Cells:
+    standing = [Conditions(_noisy(seed), (0.0, 0.0, 0.0), standing=True) for seed in range(size.seeds)]
+    outcomes = contest.play(who, [Trial(conditions, 5.0) for conditions in standing])
+    errors = np.array([outcome.height for outcome in outcomes]) - contest.walking_height
+    return {"height error mm": 1e3 * float(np.abs(errors).max()), "falls": float(sum(o.fell for o in outcomes))}
 
 
 def _survive(contest: Contest, who: Contender, trials: list[Trial]) -> Cells:

@@ -23,7 +23,7 @@ from training.reference import Reference
 from training.reward import TableReward, TaskReward
 from training.rollout import Episode, Setup, Task
 from training.symmetry import Folding
-from training.variants import VARIANTS, folding_of, make_policy, with_parameters
+from training.variants import VARIANTS, folding_of, make_policy, with_parameters, without_terms
 
 MakeEvaluator = Callable[[Setup], Evaluator]
 Report = Callable[[Row], None]
@@ -66,7 +66,7 @@ class Trainer:
         self._make_evaluator, self._reference = make_evaluator, reference
         height = config.control.gait.walking_height
         shape = make_policy(config.robot, height, VARIANTS[plan.variant], plan.terms, plan.name)
-        self.template: Policy = declared(shape, config)
+        self.template: Policy = declared(without_terms(shape, plan.without), config)
         self._first = self.template.parameters if first is None else first
         self._courses = [self._course(stage) for stage in plan.stages]
 

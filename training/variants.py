@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import msgspec
 import numpy as np
@@ -11,6 +13,7 @@ from drivers.description import RobotDescription
 from drivers.robot import Array
 from runtime.control.observation import OBSERVATION_NAMES
 from runtime.control.policy import BALANCE_TERMS, GRF_NAMES, SHIFT_NAMES, Policy, Terms, balance_policy
+from runtime.policies import PolicyError
 from training.symmetry import (
     FRONT_BACK,
     LEFT_RIGHT,
@@ -48,6 +51,29 @@ VARIANTS = {
     "mlp-plain": Variant(hidden=HIDDEN, reading="plain"),
     "mlp-grf": Variant(hidden=HIDDEN, output="grf"),
 }
+
+
+Term = Literal["velocity_integral", "capture_point", "velocity_error_bound", "centripetal", "slope"]
+"""One of the five fixed terms around the matrix (method: Past the teacher)."""
+TERMS: tuple[Term, ...] = get_args(Term)
+
+
+def find_terms(names: Collection[str]) -> tuple[Term, ...]:
+    """The terms of these names, in their own order.
+
+    Raises:
+        PolicyError: no such term.
+    """
+    for name in names:
+        if name not in TERMS:
+            raise PolicyError(f"no fixed term {name!r}: there are {', '.join(TERMS)}")
+    return tuple(term for term in TERMS if term in names)
+
+
+def without_terms(policy: Policy, names: Collection[Term]) -> Policy:
+    """The same policy with these fixed terms off."""
+    off = {field: 0.0 for name in names for field in (("slope_feet", "slope_body") if name == "slope" else (name,))}
+    return msgspec.structs.replace(policy, terms=msgspec.structs.replace(policy.terms, **off))
 
 
 def make_policy(

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from runtime.config import Config
     from runtime.control.policy import Policy
     from training.checkpoint import Checkpoint, Row, RunFolder
+    from training.contest import Contender
     from training.plan import RunPlan
     from training.reference import Reference
     from training.trainer import Trainer
@@ -45,6 +46,7 @@ def train(
     ] = "linear",
     paper: Annotated[bool, typer.Option("--paper", help="The paper's letter: one stage, no fixed terms.")] = False,
     rough: Annotated[bool, typer.Option("--rough", help="Fine-tune --start on uneven ground.")] = False,
+    without: Annotated[list[str] | None, typer.Option(help="A fixed term that stays off; may be given again.")] = None,
     start: Annotated[str | None, typer.Option(help="Policy to refine, instead of beginning at zero.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Of every stage, instead of the plan's.", min=1)] = None,
     directions: Annotated[int | None, typer.Option(help="Of every stage, instead of the plan's.", min=1)] = None,
@@ -76,8 +78,9 @@ def train(
                 from training.plan import make_plan
 
                 plan = make_plan(
-                    name, config.robot.name, config_hash(config), seed, variant, start or "", paper, rough, teacher
-                )
+                    name, config.robot.name, config_hash(config), seed, variant, start or "", paper, rough, teacher,
+                    without or (),
+                )  # fmt: skip
                 plan = plan.shortened(iterations, directions, ticks)
                 folder.begin(plan, versions())
             trainer = _trainer(config, beside, plan, folder, _reference(config, plan, reference), workers, ray)
@@ -188,14 +191,20 @@ def _finish(config: Config, folder: RunFolder, trainer: Trainer, end: Checkpoint
     write_whole(target, encode_policy(policy))
     typer.echo(f"policy: {target}")
     if validate:
-        names = [str(target), "mpc", "mpc-tuned", config.control.policy]
-        _show_table(config, names, workers, quick=True, rough=last.conditions == "rough")
+        from training.contest import find_contenders
+
+        contenders = find_contenders([str(target), "mpc", "mpc-tuned", config.control.policy])
+        _show_table(config, contenders, workers, quick=True, rough=last.conditions == "rough")
 
 
 def evaluate(
     contenders: Annotated[list[str] | None, typer.Argument(help="Policy files or shipped policies.")] = None,
     controller: Annotated[list[str] | None, typer.Option(help="mpc or mpc-tuned; may be given again.")] = None,
     baseline: Annotated[list[str] | None, typer.Option(help="zero or balance; may be given again.")] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(help="Also the first policy without this fixed term; may be given again, or all for each."),
+    ] = None,
     robot: RobotOption = "stoch3",
     quick: Annotated[bool, typer.Option("--quick", help="Few seeds, the most telling tests.")] = False,
     rough: Annotated[bool, typer.Option("--rough", help="The tests on uneven ground instead.")] = False,
@@ -211,17 +220,20 @@ def evaluate(
     """
     with one_line_errors():
         config, beside = _load(robot)
+        from training.contest import ablated, find_contenders
+
         names = [*(contenders or []), *(controller or []), *(baseline or [])] or [config.control.policy]
-        text = _show_table(config, names, workers, quick, rough, only, json, beside)
+        found = find_contenders(names, beside)
+        found += ablated(found[0], without or ())
+        text = _show_table(config, found, workers, quick, rough, only, json)
         if page is not None:
-            _write_page(config, names, beside, text, page, run, workers)
+            _write_page(config, found, text, page, run, workers)
 
 
 def _show_table(
-    config: Config, names: list[str], workers: int, quick: bool, rough: bool = False, only: list[str] | None = None,
-    json: bool = False, beside: Path | None = None,
+    config: Config, contenders: list[Contender], workers: int, quick: bool, rough: bool = False,
+    only: list[str] | None = None, json: bool = False,
 ) -> str:  # fmt: skip
-    from training.contest import find_contenders
     from training.evaluation import evaluate as play
     from training.table import FULL, QUICK, make_rough_tests, make_tests
 
@@ -233,7 +245,7 @@ def _show_table(
         tests = {name: test for name, test in tests.items() if any(part in name for part in only)}
     report = play(
         config,
-        find_contenders(names, beside),
+        contenders,
         tests,
         workers or os.cpu_count() or 1,
         lambda who, test, _: typer.echo(f"{who}: {test}", err=True),
@@ -243,14 +255,13 @@ def _show_table(
 
 
 def _write_page(
-    config: Config, names: list[str], beside: Path, text: str, target: Path, run: Path | None, workers: int
+    config: Config, contenders: list[Contender], text: str, target: Path, run: Path | None, workers: int
 ) -> None:
     from training import figures
     from training.checkpoint import RunFolder
-    from training.contest import Contest, find_contenders
+    from training.contest import Contest
     from training.reference import make_reference
 
-    contenders = find_contenders(names, beside)
     first, recorder = contenders[0], figures.Recorder(config)
     drawn = {
         "Fig. 4: on flat ground": figures.figure_4(recorder, contenders, make_reference(config)),
