@@ -102,6 +102,8 @@ def verify(policy: Policy, robot: str, place: str) -> None:
     ):
         _same_names(key, names, wanted, place)
     _shape("observation_scale", (policy.observation_scale,), 1, 28, place)
+    if policy.observation_offset:
+        _shape("observation_offset", (policy.observation_offset,), 1, 28, place)
     _shape("action_scale", (policy.action_scale,), 1, len(actions), place)
     _shape("action_bound", (policy.action_bound,), 1, len(actions), place)
     if bool(policy.matrix) == bool(policy.hidden):

@@ -299,7 +299,8 @@ class PlainController:
             now[9] -= self.followed[2]
         before = now if self.previous is None else self.previous
         self.previous = now
-        r["observation"] = np.concatenate([now, before]) * self.policy.observation_scale
+        offset = np.array(self.policy.observation_offset or (0.0,) * 28)
+        r["observation"] = (np.concatenate([now, before]) - offset) * self.policy.observation_scale
 
     def act(self) -> Array | None:
         """Fill ``asked`` and ``action``; the forces of a direct policy are returned."""

@@ -93,6 +93,14 @@ def test_second_half_is_the_tick_before_at_its_own_scale() -> None:
     assert second[0] == 0.5 and second[14] == pytest.approx(0.6 * 15.0)
 
 
+def test_the_offset_is_taken_before_the_scale() -> None:
+    scale, offset = np.arange(1.0, 29.0), np.linspace(-1.0, 1.0, 28)
+    plain = look(bench("plain"))
+    known = bench("plain")
+    known.chosen.observation_scale, known.chosen.observation_offset = scale, offset
+    np.testing.assert_allclose(look(known), (plain - offset) * scale)
+
+
 def test_the_first_tick_has_itself_as_its_past() -> None:
     found = look(bench("plain"))
     np.testing.assert_array_equal(found[:14], found[14:])

@@ -121,6 +121,7 @@ def random_policy(seed: int, **changes: Any) -> Policy:
         policy(),
         matrix=tuple(map(tuple, rng.normal(0, 0.3, (18, 28)))),
         observation_scale=tuple(rng.uniform(0.1, 10, 28)),
+        observation_offset=tuple(rng.uniform(-0.5, 1.5, 28)),
         action_scale=tuple(rng.uniform(0.05, 1, 12)) + tuple(rng.uniform(10, 100, 6)),
         action_bound=tuple(rng.uniform(0.05, 0.3, 12)) + tuple(rng.uniform(50, 400, 6)),
         **changes,

@@ -90,7 +90,12 @@ def test_wrong_shape(height: int, width: int) -> None:
 
 @pytest.mark.parametrize(
     ("key", "length", "wanted"),
-    [("observation_scale", 27, "28"), ("action_scale", 19, "18"), ("action_bound", 0, "18")],
+    [
+        ("observation_scale", 27, "28"),
+        ("observation_offset", 14, "28"),
+        ("action_scale", 19, "18"),
+        ("action_bound", 0, "18"),
+    ],
 )
 def test_wrong_length(key: str, length: int, wanted: str) -> None:
     message = refusal({**table(), key: [1.0] * length})

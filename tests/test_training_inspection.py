@@ -30,14 +30,16 @@ def test_physical_units_undo_the_scales(config: Config) -> None:
 
 def test_the_worst_case_is_reached_and_never_passed(config: Config) -> None:
     physical = inspect(policy(config)).physical
-    worst = worst_case(physical)
+    offset = np.array(policy(config).observation_offset)
+    assert set(offset) == {0.0, 1.0}
+    worst = worst_case(physical, offset)
     rng = np.random.default_rng(2)
     low = np.concatenate([-BOX[:10], np.zeros(4)] * 2)
     high = np.concatenate([BOX, BOX])
     samples = rng.uniform(low, high, (2000, 28))
-    assert (np.abs(samples @ physical.T).max(axis=0) <= worst + 1e-9).all()
+    assert (np.abs((samples - offset) @ physical.T).max(axis=0) <= worst + 1e-9).all()
     corners = np.concatenate([np.where(physical > 0, high, low), np.where(physical > 0, low, high)])
-    reached = np.abs(corners @ physical.T)
+    reached = np.abs((corners - offset) @ physical.T)
     np.testing.assert_allclose(reached.max(axis=0), worst)
 
 

@@ -13,7 +13,8 @@ from drivers.robot import Array
 from runtime import config as configuration
 from runtime import policies
 from runtime.config import Config
-from runtime.control.policy import BALANCE_TERMS
+from runtime.control.policy import BALANCE_TERMS, balance_policy
+from runtime.policies import PolicyError
 from training import checkpoint as checkpoints
 from training.checkpoint import Row, RunError, RunFolder
 from training.plan import RunPlan, StagePlan
@@ -21,7 +22,7 @@ from training.provenance import config_hash, versions
 from training.reference import Reference, make_reference
 from training.rollout import Episode, Setup, Task
 from training.trainer import Trainer
-from training.variants import VARIANTS, folding_of, make_policy, with_parameters
+from training.variants import VARIANTS, first_numbers, folding_of, make_policy, with_parameters
 
 FIRST = StagePlan(name="first", reward="table", iterations=4, directions=6, ticks=50, conditions="nominal")
 SECOND = StagePlan(
@@ -263,3 +264,20 @@ def test_a_run_without_a_term_makes_policies_without_it(tmp_path: Path, config: 
     made = msgspec.structs.replace(plan(config), without=("capture_point",))
     trainer = begin(config, reference, tmp_path / "run", made)
     assert trainer.policy(trainer.start()).terms == msgspec.structs.replace(BALANCE_TERMS, capture_point=0.0)
+
+
+def test_all_four_feet_down_ask_a_trained_shape_for_nothing(config: Config) -> None:
+    height = config.control.gait.walking_height
+    made = make_policy(config.robot, height, VARIANTS["linear"], terms=True)
+    down = np.array([0.0] * 10 + [1.0] * 4 + [0.0] * 10 + [1.0] * 4)
+    np.testing.assert_array_equal(down - made.observation_offset, 0.0)
+    assert make_policy(config.robot, height, VARIANTS["linear-plain"], terms=True).observation_offset == ()
+
+
+def test_numbers_that_read_the_contacts_otherwise_are_no_start(config: Config) -> None:
+    height = config.control.gait.walking_height
+    by_hand = balance_policy(config.robot, height)
+    np.testing.assert_array_equal(first_numbers(by_hand), by_hand.parameters)
+    reading = with_parameters(by_hand, np.ones(504))
+    with pytest.raises(PolicyError, match=r"contact_FL, contact_FR.*cannot be refined"):
+        first_numbers(reading)

@@ -58,7 +58,8 @@ def inspect(policy: Policy) -> Inspection:
     ]
     contact = [10 + leg for leg in range(len(LEGS))]
     dead = np.abs(physical[:, contact] + physical[:, [14 + column for column in contact]])
-    return Inspection(physical, errors[0], errors[1], worst_case(physical), np.array(policy.action_bound), dead)
+    worst = worst_case(physical, np.array(policy.observation_offset or (0.0,) * 28))
+    return Inspection(physical, errors[0], errors[1], worst, np.array(policy.action_bound), dead)
 
 
 def matrix_of(policy: Policy) -> Array:
@@ -74,18 +75,16 @@ def matrix_of(policy: Policy) -> Array:
     return np.array(policy.matrix)
 
 
-def worst_case(physical: Array) -> Array:
-    """Exact maximum of |M s| over the box: a linear function is largest in a corner. Shape (actions,).
+def worst_case(physical: Array, offset: Array) -> Array:
+    """Exact maximum of |M (s - offset)| over the box: a linear function is largest in a corner. Shape (actions,).
 
-    Contacts lie in [0, 1], so only their gains of one sign count.
+    Contacts lie in [0, 1], all else about zero.
     """
-    half = np.concatenate([BOX, BOX])
-    contact = np.zeros(28, dtype=bool)
-    contact[10:14] = contact[24:28] = True
-    swing = (np.abs(physical[:, ~contact]) * half[~contact]).sum(axis=1)
-    up = np.maximum(physical[:, contact], 0.0).sum(axis=1)
-    down = np.maximum(-physical[:, contact], 0.0).sum(axis=1)
-    return np.asarray(swing + np.maximum(up, down))
+    low, high = -np.concatenate([BOX, BOX]), np.concatenate([BOX, BOX])
+    low[10:14] = low[24:28] = 0.0
+    at_low, at_high = physical * (low - offset), physical * (high - offset)
+    largest, smallest = np.maximum(at_low, at_high).sum(axis=1), np.minimum(at_low, at_high).sum(axis=1)
+    return np.asarray(np.maximum(largest, -smallest))
 
 
 def describe(policy: Policy, strongest: int = 4) -> str:
@@ -127,7 +126,15 @@ def compare(first: Policy, second: Policy, strongest: int = 12) -> str:
         f"distance {np.linalg.norm(matrix_of(second) - matrix_of(first)):.3f} in scaled units, "
         f"norms {np.linalg.norm(matrix_of(first)):.3f} and {np.linalg.norm(matrix_of(second)):.3f}",
     ]
-    shape = ("reading", "shift_time_constant", "terms", "observation_scale", "action_scale", "action_bound")
+    shape = (
+        "reading",
+        "shift_time_constant",
+        "terms",
+        "observation_scale",
+        "observation_offset",
+        "action_scale",
+        "action_bound",
+    )
     lines += [
         f"{name}: {getattr(first, name)} → {getattr(second, name)}"
         for name in shape

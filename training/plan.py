@@ -84,11 +84,11 @@ SHED = msgspec.structs.replace(
 """Numbers that grew while nothing asked for them make a robot fall that is pushed hard: they fade here."""
 POLISH = msgspec.structs.replace(
     SERVE, name="polish", iterations=180, directions=64, stdev=0.04, learning_rate=0.02, learning_rate_end=0.001,
-    fall_weight=5.0, weight_decay=0.1,
+    fall_weight=5.0, weight_decay=0.1, conditions="wide",
 )  # fmt: skip
 """What was shed is won back, where it serves."""
 REFINE = msgspec.structs.replace(
-    POLISH, name="refine", learning_rate=0.015, learning_rate_end=0.0015, weight_decay=0.05
+    POLISH, name="refine", iterations=100, learning_rate=0.015, learning_rate_end=0.0015, weight_decay=0.05
 )
 """From numbers that already walk."""
 ROUGHEN = msgspec.structs.replace(

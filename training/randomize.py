@@ -86,7 +86,14 @@ TASK = Randomization(
     velocity_x=(-0.6, 1.6), velocity_y=0.4, yaw_rate=1.0, zeroed_axes=0.25,
 )  # fmt: skip
 """The second stage, from the method's page."""
-WIDE = replace(TASK, standing_share=0.12, weak_share=0.25, motor_strength=(0.42, 1.0), push_impulse=(10.0, 50.0))
+WIDE = replace(
+    TASK,
+    friction=(0.4, 1.2),
+    push_impulse=(10.0, 50.0),
+    standing_share=0.06,
+    weak_share=0.2,
+    motor_strength=(0.42, 0.7),
+)
 """The task, standing, and motors that give less than they should."""
 ROUGH = Randomization(
     tilt=0.2, friction=(0.6, 1.2), noise=True, push_probability=0.4, push_impulse=(10.0, 35.0), push_time=(0.6, 2.5),

@@ -26,6 +26,8 @@ from training.symmetry import (
     no_folding,
 )
 
+ALL_DOWN = 2 * ((0.0,) * 10 + (1.0,) * 4)
+"""The relative reading of the contacts: relative to all four feet on the ground."""
 HIDDEN = 16
 """Neurons of the small fully-connected variant."""
 SYMMETRIES = {"none": (), "left-right": (LEFT_RIGHT,), "both": (LEFT_RIGHT, FRONT_BACK)}
@@ -96,6 +98,7 @@ def make_policy(
         reading=variant.reading,
         output=variant.output,
         observation_names=OBSERVATION_NAMES,
+        observation_offset=ALL_DOWN if variant.reading == "relative" else (),
         action_names=names,
         action_scale=tuple(scale.tolist()),
         action_bound=tuple(bound.tolist()),
@@ -117,6 +120,20 @@ def with_parameters(policy: Policy, parameters: Array) -> Policy:
         hidden=_rows(parameters[: hidden * 28].reshape(hidden, 28)),
         readout=_rows(parameters[hidden * 28 :].reshape(-1, hidden)),
     )
+
+
+def first_numbers(policy: Policy) -> Array:
+    """A policy's numbers as the first mean of a run, whose policies read contacts relative to ``ALL_DOWN``.
+
+    Raises:
+        PolicyError: it reads what it uses of them otherwise: its numbers would mean something else.
+    """
+    differs = np.array(policy.observation_offset or (0.0,) * 28) != ALL_DOWN
+    layer = np.array(policy.matrix or policy.hidden)
+    if policy.reading == "relative" and layer[:, differs].any():
+        names = ", ".join(name for name, other in zip(policy.observation_names, differs, strict=True) if other)
+        raise PolicyError(f"{policy.name}: other observation_offset than training's at {names}: it cannot be refined")
+    return policy.parameters
 
 
 def folding_of(policy: Policy, symmetry: str) -> Folding:

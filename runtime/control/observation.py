@@ -23,7 +23,7 @@ _OBSERVATION = int(Clamp.OBSERVATION)
 
 @compiled
 def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
-    """Fill ``observation`` (28,) with 14 numbers now and the same 14 one tick ago, scaled.
+    """Fill ``observation`` (28,) with 14 numbers now and the same 14 one tick ago, less the policy's offset, scaled.
 
     The *relative* reading subtracts what is wanted: walking height, commanded heading, commanded velocity and turn. The
     *plain* one is the paper's letter. Both subtract the body pose that the operator asks for. The velocity error is
@@ -55,6 +55,6 @@ def observe(p, policy, s, t):  # type: ignore[no-untyped-def]
         before = s.previous[i] if s.remembered else now[i]
         s.previous[i] = now[i]
         s.seen[i], s.seen[14 + i] = now[i], before
-        t.observation[i] = now[i] * policy.observation_scale[i]
-        t.observation[14 + i] = before * policy.observation_scale[14 + i]
+        t.observation[i] = (now[i] - policy.observation_offset[i]) * policy.observation_scale[i]
+        t.observation[14 + i] = (before - policy.observation_offset[14 + i]) * policy.observation_scale[14 + i]
     s.remembered = 1

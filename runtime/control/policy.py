@@ -66,6 +66,9 @@ class Policy(Record, frozen=True, kw_only=True):
     action_names: tuple[str, ...]
     observation_scale: tuple[Number, ...]
     """Multiplies the observation before the matrix; 28 numbers."""
+    observation_offset: tuple[Number, ...] = ()
+    """Taken from the observation before its scale; 28 numbers, or none for zero. One at the contacts makes a foot that
+    is *not* on the ground the signal: what a trot needs for ever is then gone when all four stand."""
     action_scale: tuple[Number, ...]
     """m, N, N·m per unit of the matrix's output."""
     action_bound: tuple[Positive, ...]
@@ -94,6 +97,7 @@ def policy_record(policy: Policy) -> Records:
     r = record[0]
     r["relative"], r["direct"] = policy.reading == "relative", policy.output == "grf"
     r["observation_scale"] = policy.observation_scale
+    r["observation_offset"] = policy.observation_offset or 0.0
     actions = len(policy.action_names)
     r["action_scale"][:actions], r["action_bound"][:actions] = policy.action_scale, policy.action_bound
     r["shift_time_constant"] = policy.shift_time_constant
@@ -153,7 +157,7 @@ def act(p, policy, outgoing, s, t):  # type: ignore[no-untyped-def]
     if p.policy_share < 1.0:
         other, seen = np.zeros(24), np.empty(28)
         for i in range(28):
-            seen[i] = s.seen[i] * outgoing.observation_scale[i]
+            seen[i] = (s.seen[i] - outgoing.observation_offset[i]) * outgoing.observation_scale[i]
         ask(outgoing, seen, actions, other)
         for a in range(actions):
             out[a] = p.policy_share * out[a] + (1.0 - p.policy_share) * other[a]

@@ -165,6 +165,7 @@ POLICY_DTYPE = np.dtype(
         ("direct", "u1"),  # outputs ground reaction forces instead of a wrench
         ("hidden_size", "i8"),  # 0: linear
         ("observation_scale", "f8", (28,)),
+        ("observation_offset", "f8", (28,)),
         ("action_scale", "f8", (24,)),
         ("action_bound", "f8", (24,)),
         ("shift_time_constant", "f8"),
