@@ -4,6 +4,7 @@ import os
 import pickle
 import signal
 from collections.abc import Iterator
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -15,7 +16,20 @@ from runtime.control.policy import Policy, balance_policy
 from sim.scenario import Push, Scenario
 from training import evaluators
 from training.evaluators import InProcess, Processes
-from training.randomize import IMITATION, NOMINAL, ROUGH, STANDING_PUSH, TASK, WIDE, Conditions, Randomization, draw
+from training.plan import StagePlan
+from training.randomize import (
+    IMITATION,
+    NOMINAL,
+    ROUGH,
+    SETS,
+    STANDING_PUSH,
+    TASK,
+    WEAK,
+    WIDE,
+    Conditions,
+    Randomization,
+    draw,
+)
 from training.reference import make_reference
 from training.reward import TableReward, TaskReward
 from training.rollout import Episode, Setup, Stage, Task
@@ -87,6 +101,8 @@ def test_some_episodes_stand_and_some_motors_are_weak() -> None:
     weak = strengths[strengths < 1.0]
     assert 0.2 < weak.size / strengths.size < 0.3
     assert weak.min() < 0.46 and weak.max() > 0.95
+    halved = np.array([draw(WEAK, rng).scenario.motor_strength for _ in range(400)])
+    assert 0.8 < (halved == 1.0).mean() < 0.9 and halved[halved < 1.0].max() < 0.6
 
 
 def test_nominal_conditions_are_the_worlds_own() -> None:
@@ -230,3 +246,7 @@ def test_bounds_given_by_hand_are_drawn_from() -> None:
     scenario = draw(bounds, np.random.default_rng(0)).scenario
     assert 1 <= scenario.payload <= 2 and 0.8 <= scenario.motor_strength <= 0.9
     assert 0.001 <= scenario.extra_delay <= 0.002
+
+
+def test_every_condition_that_a_plan_may_name_is_a_set() -> None:
+    assert set(get_args(get_type_hints(StagePlan)["conditions"])) == set(SETS)

@@ -13,16 +13,15 @@ from drivers.robot import Array
 from runtime import config as configuration
 from runtime import policies
 from runtime.config import Config
-from runtime.control.policy import BALANCE_TERMS, balance_policy
-from runtime.policies import PolicyError
+from runtime.control.policy import BALANCE_TERMS, Policy, ask, policy_record
 from training import checkpoint as checkpoints
-from training.checkpoint import Row, RunError, RunFolder
+from training.checkpoint import Checkpoint, Row, RunError, RunFolder
 from training.plan import RunPlan, StagePlan
 from training.provenance import config_hash, versions
 from training.reference import Reference, make_reference
 from training.rollout import Episode, Setup, Task
 from training.trainer import Trainer
-from training.variants import VARIANTS, first_numbers, folding_of, make_policy, with_parameters
+from training.variants import ALL_DOWN, VARIANTS, folding_of, make_policy, reading_contacts, with_parameters
 
 FIRST = StagePlan(name="first", reward="table", iterations=4, directions=6, ticks=50, conditions="nominal")
 SECOND = StagePlan(
@@ -266,18 +265,35 @@ def test_a_run_without_a_term_makes_policies_without_it(tmp_path: Path, config: 
     assert trainer.policy(trainer.start()).terms == msgspec.structs.replace(BALANCE_TERMS, capture_point=0.0)
 
 
-def test_all_four_feet_down_ask_a_trained_shape_for_nothing(config: Config) -> None:
-    height = config.control.gait.walking_height
-    made = make_policy(config.robot, height, VARIANTS["linear"], terms=True)
-    down = np.array([0.0] * 10 + [1.0] * 4 + [0.0] * 10 + [1.0] * 4)
-    np.testing.assert_array_equal(down - made.observation_offset, 0.0)
-    assert make_policy(config.robot, height, VARIANTS["linear-plain"], terms=True).observation_offset == ()
+@pytest.mark.parametrize("name", ["linear", "mlp"])
+def test_contacts_read_from_four_feet_down_leave_the_trot_and_rest_when_it_stands(config: Config, name: str) -> None:
+    rng = np.random.default_rng(3)
+    made = make_policy(config.robot, config.control.gait.walking_height, VARIANTS[name], terms=True)
+    before = with_parameters(made, rng.standard_normal(made.parameters.size))
+    after = reading_contacts(before, True)
+    assert after.observation_offset == ALL_DOWN and reading_contacts(after, True) is after
+    seen = rng.standard_normal(28)
+    for feet in ([1, 0, 0, 1], [0, 1, 1, 0]):
+        seen[10:14] = seen[24:28] = feet
+        np.testing.assert_allclose(answer(before, seen), answer(after, seen))
+    still = np.array([0.0] * 10 + [1.0] * 4 + [0.0] * 10 + [1.0] * 4)
+    np.testing.assert_array_equal(answer(after, still), 0.0)
+    assert np.abs(answer(before, still)).max() > 0
+    back = reading_contacts(after, False)
+    np.testing.assert_allclose(back.parameters, before.parameters)
 
 
-def test_numbers_that_read_the_contacts_otherwise_are_no_start(config: Config) -> None:
-    height = config.control.gait.walking_height
-    by_hand = balance_policy(config.robot, height)
-    np.testing.assert_array_equal(first_numbers(by_hand), by_hand.parameters)
-    reading = with_parameters(by_hand, np.ones(504))
-    with pytest.raises(PolicyError, match=r"contact_FL, contact_FR.*cannot be refined"):
-        first_numbers(reading)
+def answer(policy: Policy, seen: Array) -> Array:
+    record, out = policy_record(policy), np.zeros(24)
+    observation = (seen - record[0]["observation_offset"]) * record[0]["observation_scale"]
+    ask(record[0], observation, len(policy.action_names), out)
+    return out
+
+
+def test_a_stage_that_rests_goes_on_with_the_same_trot(tmp_path: Path, config: Config, reference: Reference) -> None:
+    made = plan(config, FIRST, msgspec.structs.replace(SECOND, rest=True, symmetry="none"))
+    trainer = begin(config, reference, tmp_path / "run", made)
+    end = trainer.run(trainer.start(), lambda _: None)
+    first = Checkpoint(0, 4, trainer.folder.load(FIRST.iterations).state)
+    first_policy, last_policy = trainer.policy(first), trainer.policy(end)
+    assert first_policy.observation_offset == () and last_policy.observation_offset == ALL_DOWN

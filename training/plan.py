@@ -25,9 +25,11 @@ class StagePlan(Record, frozen=True, kw_only=True):
     iterations: Count
     directions: Count = 64
     ticks: Count = 1000
-    conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "wide", "rough"] = "imitation"
+    conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "wide", "weak", "rough"] = "imitation"
     """Bounds of the draws: ``training.randomize.SETS``."""
     symmetry: Literal["none", "left-right", "both"] = "left-right"
+    rest: bool = False
+    """Contacts are read less four feet on the ground, so that who stands asks for nothing (decision 14)."""
     stdev: Positive = 0.1
     stdev_learning_rate: NonNegative = 0.1
     learning_rate: Positive = 0.05
@@ -84,17 +86,17 @@ SHED = msgspec.structs.replace(
 """Numbers that grew while nothing asked for them make a robot fall that is pushed hard: they fade here."""
 POLISH = msgspec.structs.replace(
     SERVE, name="polish", iterations=180, directions=64, stdev=0.04, learning_rate=0.02, learning_rate_end=0.001,
-    fall_weight=5.0, weight_decay=0.1, conditions="wide",
+    fall_weight=5.0, weight_decay=0.1,
 )  # fmt: skip
 """What was shed is won back, where it serves."""
-REFINE = msgspec.structs.replace(
-    POLISH, name="refine", iterations=100, learning_rate=0.015, learning_rate_end=0.0015, weight_decay=0.05
-)
-"""From numbers that already walk."""
+SETTLE = msgspec.structs.replace(POLISH, name="settle", iterations=120, conditions="weak", weight_decay=0.05, rest=True)
+"""From numbers that walk: what stands asks for nothing, and motors may be weak."""
 ROUGHEN = msgspec.structs.replace(
-    POLISH, name="roughen", iterations=40, ticks=700, conditions="rough", learning_rate_end=0.003
-)
-"""The same on uneven ground, which takes longer to cross."""
+    POLISH, name="roughen", iterations=80, directions=48, ticks=700, conditions="rough", learning_rate=0.04,
+    learning_rate_end=0.004, rest=True,
+)  # fmt: skip
+"""The same on uneven ground, which takes longer to cross; the large steps are for the contacts' small scale, by which
+feet learn to rise higher."""
 PAPER = StagePlan(name="imitate", reward="table", iterations=60, conditions="imitation", symmetry="none")
 """Section IV.B: 64 directions, 1000 ticks, 60 iterations; with the sensors' noise, without which nothing transfers."""
 
@@ -112,9 +114,11 @@ def make_plan(
     without: Sequence[str] = (),
 ) -> RunPlan:
     """The plan of a ``trotd train`` from nothing, from a policy's numbers, by the paper's letter or on rough ground."""
-    stages: tuple[StagePlan, ...] = (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, SHED, POLISH)
+    stages: tuple[StagePlan, ...] = (
+        (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, SHED, POLISH, SETTLE)
+    )
     if start and not paper and not rough:
-        stages = (REFINE,)
+        stages = (SETTLE,)
     if variant.endswith("plain"):  # commands mean nothing to it: it can only imitate one
         stages = tuple(stage for stage in stages if stage.reward == "table") or stages
     return msgspec.convert(

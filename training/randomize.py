@@ -86,20 +86,16 @@ TASK = Randomization(
     velocity_x=(-0.6, 1.6), velocity_y=0.4, yaw_rate=1.0, zeroed_axes=0.25,
 )  # fmt: skip
 """The second stage, from the method's page."""
-WIDE = replace(
-    TASK,
-    friction=(0.4, 1.2),
-    push_impulse=(10.0, 50.0),
-    standing_share=0.06,
-    weak_share=0.2,
-    motor_strength=(0.42, 0.7),
-)
+WIDE = replace(TASK, push_impulse=(10.0, 50.0), standing_share=0.12, weak_share=0.25, motor_strength=(0.42, 1.0))
 """The task, standing, and motors that give less than they should."""
+WEAK = replace(TASK, friction=(0.5, 1.2), weak_share=0.15, motor_strength=(0.42, 0.6))
+"""The task, and motors at half their strength: what a hard torque clip leaves."""
 ROUGH = Randomization(
     tilt=0.2, friction=(0.6, 1.2), noise=True, push_probability=0.4, push_impulse=(10.0, 35.0), push_time=(0.6, 2.5),
-    bump=0.08, slope=0.2, level_share=0.2, velocity_x=(-0.3, 1.0), velocity_y=0.3, yaw_rate=0.8, zeroed_axes=0.25,
+    bump=0.1, bump_spacing=(0.1, 0.2), slope=0.2, level_share=0.15,
+    velocity_x=(-0.3, 1.0), velocity_y=0.3, yaw_rate=0.8, zeroed_axes=0.25,
 )  # fmt: skip
-"""Fine-tuning on height fields, beyond the paper's ±5 cm."""
+"""Fine-tuning on height fields, beyond the paper's ±5 cm: up to ±10 cm within 10 to 20."""
 SETS = {
     "nominal": NOMINAL,
     "paper": PAPER,
@@ -107,6 +103,7 @@ SETS = {
     "imitation": IMITATION,
     "task": TASK,
     "wide": WIDE,
+    "weak": WEAK,
     "rough": ROUGH,
 }
 

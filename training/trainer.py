@@ -23,7 +23,7 @@ from training.reference import Reference
 from training.reward import TableReward, TaskReward
 from training.rollout import Episode, Setup, Task
 from training.symmetry import Folding
-from training.variants import VARIANTS, folding_of, make_policy, with_parameters, without_terms
+from training.variants import VARIANTS, folding_of, make_policy, reading_contacts, with_parameters, without_terms
 
 MakeEvaluator = Callable[[Setup], Evaluator]
 Report = Callable[[Row], None]
@@ -36,6 +36,8 @@ class _Course:
     """A stage, ready to run."""
 
     plan: StagePlan
+    template: Policy
+    """Its policies but for the numbers."""
     folding: Folding
     params: pgpe.Params
 
@@ -50,7 +52,7 @@ class Trainer:
         folder: RunFolder,
         make_evaluator: MakeEvaluator,
         reference: Reference | None,
-        first: Array | None = None,
+        first: Policy | None = None,
     ) -> None:
         """Prepare.
 
@@ -60,15 +62,17 @@ class Trainer:
             folder: where to keep it.
             make_evaluator: gives the workers of a stage.
             reference: what table stages imitate.
-            first: numbers of the first mean, zero where not given. Shape (n,).
+            first: whose numbers the first mean has; zero where not given.
         """
         self.config, self.plan, self.folder = config, plan, folder
         self._make_evaluator, self._reference = make_evaluator, reference
         height = config.control.gait.walking_height
         shape = make_policy(config.robot, height, VARIANTS[plan.variant], plan.terms, plan.name)
-        self.template: Policy = declared(without_terms(shape, plan.without), config)
-        self._first = self.template.parameters if first is None else first
-        self._courses = [self._course(stage) for stage in plan.stages]
+        template = declared(without_terms(shape, plan.without), config)
+        self._first = template if first is None else first
+        self._courses = [self._course(stage, template) for stage in plan.stages]
+        self.template: Policy = self._courses[0].template
+        """The first stage's policies but for their numbers."""
 
     def start(self) -> Checkpoint:
         """The run before its first iteration, saved."""
@@ -80,8 +84,7 @@ class Trainer:
         """Go on from ``checkpoint`` to the end of the last stage."""
         for number in range(checkpoint.stage, len(self._courses)):
             if number > checkpoint.stage:
-                mean = self._courses[checkpoint.stage].folding.unfold(checkpoint.state.mean)
-                checkpoint = Checkpoint(number, checkpoint.iteration, self._enter(number, mean))
+                checkpoint = Checkpoint(number, checkpoint.iteration, self._enter(number, self._mean(checkpoint)))
             for reached, row in self._iterate(checkpoint):
                 self.folder.save(reached, self._policy_file(reached), row)
                 report(row)
@@ -90,15 +93,17 @@ class Trainer:
 
     def policy(self, checkpoint: Checkpoint) -> Policy:
         """The mean as a policy, with how it was made."""
-        parameters = self._courses[checkpoint.stage].folding.unfold(checkpoint.state.mean)
-        trained = with_parameters(self.template, parameters)
-        return msgspec.structs.replace(trained, provenance=self._provenance(checkpoint))
+        return msgspec.structs.replace(self._mean(checkpoint), provenance=self._provenance(checkpoint))
+
+    def _mean(self, checkpoint: Checkpoint) -> Policy:
+        course = self._courses[checkpoint.stage]
+        return with_parameters(course.template, course.folding.unfold(checkpoint.state.mean))
 
     def _iterate(self, checkpoint: Checkpoint) -> Iterator[tuple[Checkpoint, Row]]:
         course = self._courses[checkpoint.stage]
         if checkpoint.state.iteration >= course.plan.iterations:
             return
-        evaluator = self._make_evaluator(self._setup(course.plan))
+        evaluator = self._make_evaluator(self._setup(course))
         try:
             while checkpoint.state.iteration < course.plan.iterations:
                 checkpoint, row = self._step(checkpoint, course, evaluator)
@@ -125,19 +130,21 @@ class Trainer:
         scenario = Scenario(noise=SENSORS) if noisy else Scenario()
         return Conditions(scenario, VALIDATION_COMMAND if stage.reward == "task" else None)
 
-    def _setup(self, stage: StagePlan) -> Setup:
+    def _setup(self, course: _Course) -> Setup:
+        stage = course.plan
         features = commands = None
         if stage.reward == "table":
             assert self._reference is not None, "a table stage imitates a reference"
             features, commands = self._reference.resampled(self.config.control.rate_hz, stage.ticks)
         reward = TableReward() if stage.reward == "table" else TaskReward()
-        return Setup(self.config, self.template, reward, stage.ticks, features, commands, self.plan.physics_rate_hz)
+        return Setup(self.config, course.template, reward, stage.ticks, features, commands, self.plan.physics_rate_hz)
 
-    def _enter(self, number: int, mean: Array) -> pgpe.State:
+    def _enter(self, number: int, start: Policy) -> pgpe.State:
         course = self._courses[number]
-        return pgpe.start(course.folding.fold(mean), course.plan.stdev)
+        read = reading_contacts(start, course.plan.rest)
+        return pgpe.start(course.folding.fold(read.parameters), course.plan.stdev)
 
-    def _course(self, stage: StagePlan) -> _Course:
+    def _course(self, stage: StagePlan, template: Policy) -> _Course:
         params = pgpe.Params(
             directions=stage.directions,
             learning_rate=stage.learning_rate,
@@ -146,7 +153,8 @@ class Trainer:
             stdev_learning_rate=stage.stdev_learning_rate,
             weight_decay=stage.weight_decay,
         )
-        return _Course(stage, folding_of(self.template, stage.symmetry), params)
+        template = reading_contacts(template, stage.rest)
+        return _Course(stage, template, folding_of(template, stage.symmetry), params)
 
     def _policy_file(self, checkpoint: Checkpoint) -> bytes:
         return encode_policy(self.policy(checkpoint))

@@ -27,7 +27,7 @@ from training.symmetry import (
 )
 
 ALL_DOWN = 2 * ((0.0,) * 10 + (1.0,) * 4)
-"""The relative reading of the contacts: relative to all four feet on the ground."""
+"""Offset of an observation in which only feet in the air are seen."""
 HIDDEN = 16
 """Neurons of the small fully-connected variant."""
 SYMMETRIES = {"none": (), "left-right": (LEFT_RIGHT,), "both": (LEFT_RIGHT, FRONT_BACK)}
@@ -98,7 +98,6 @@ def make_policy(
         reading=variant.reading,
         output=variant.output,
         observation_names=OBSERVATION_NAMES,
-        observation_offset=ALL_DOWN if variant.reading == "relative" else (),
         action_names=names,
         action_scale=tuple(scale.tolist()),
         action_bound=tuple(bound.tolist()),
@@ -122,18 +121,21 @@ def with_parameters(policy: Policy, parameters: Array) -> Policy:
     )
 
 
-def first_numbers(policy: Policy) -> Array:
-    """A policy's numbers as the first mean of a run, whose policies read contacts relative to ``ALL_DOWN``.
+def reading_contacts(policy: Policy, all_down: bool) -> Policy:
+    """The same trot from a policy that reads the contacts less ``ALL_DOWN``, or as they are.
 
-    Raises:
-        PolicyError: it reads what it uses of them otherwise: its numbers would mean something else.
+    Each number changes so that with two feet on the ground, whichever diagonal, the same is answered as before; with
+    four, all of it is new (decision 14).
     """
-    differs = np.array(policy.observation_offset or (0.0,) * 28) != ALL_DOWN
+    wanted = ALL_DOWN if all_down else ()
+    if policy.observation_offset == wanted:
+        return policy
     layer = np.array(policy.matrix or policy.hidden)
-    if policy.reading == "relative" and layer[:, differs].any():
-        names = ", ".join(name for name, other in zip(policy.observation_names, differs, strict=True) if other)
-        raise PolicyError(f"{policy.name}: other observation_offset than training's at {names}: it cannot be refined")
-    return policy.parameters
+    for first in (10, 24):
+        feet = layer[:, first : first + 4]
+        feet -= 0.5 * feet.sum(axis=1, keepdims=True)
+    read = msgspec.structs.replace(policy, observation_offset=wanted)
+    return msgspec.structs.replace(read, **{"matrix" if policy.matrix else "hidden": _rows(layer)})
 
 
 def folding_of(policy: Policy, symmetry: str) -> Folding:

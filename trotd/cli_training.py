@@ -115,11 +115,10 @@ def _trainer(
     from training.evaluators import make_evaluator
     from training.reference import save_reference
     from training.trainer import Trainer
-    from training.variants import first_numbers
 
     first = None
     if plan.start:
-        first = first_numbers(policies.load(policies.find_policy(plan.start, beside), config.robot.name))
+        first = policies.load(policies.find_policy(plan.start, beside), config.robot.name)
     if reference is not None:
         save_reference(reference, folder.path / "reference.npz")
     return Trainer(config, plan, folder, lambda setup: make_evaluator(setup, workers or None, ray), reference, first)
