@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from runtime import config as configuration
+from runtime.policies import SHIPPED as POLICIES
 from runtime.policies import PolicyError, find_policy
 from sim.scenario import Push, Scenario
 from sim.world import World
@@ -30,6 +31,7 @@ from training.randomize import SENSORS, Conditions
 from training.robot_reference import record_reference
 from training.rollout import walk
 
+SHIPPED = sorted(path.stem for path in POLICIES.glob("*.json") if json.loads(path.read_text())["robot"] == "stoch3")
 CONFIG = configuration.load(configuration.find_robot("stoch3"))
 
 
@@ -60,6 +62,23 @@ def test_every_built_in_contender_stands(name: str, world: World) -> None:
     conditions = Conditions(Scenario(noise=SENSORS), (0.0, 0.0, 0.0), standing=True)
     _, fell = walk(world, walker, conditions, np.zeros((300, 3)), watch)
     assert not fell and np.all(stances)
+    assert world.truth.position[2] == pytest.approx(CONFIG.control.gait.walking_height, abs=0.01)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_policy_stands_for_as_long_as_one_likes(name: str, world: World) -> None:
+    """A lean that grows by half each second is nothing in a walk, whose steps catch it, and a fall for who stands."""
+    worst = 0.0
+
+    def watch(tick: int, _: object) -> bool:
+        nonlocal worst
+        worst = max(worst, float(np.abs(walker.record["rpy"][0, :2]).max())) if tick > 400 else worst
+        return True
+
+    walker = Contender(name, "policy", str(find_policy(name))).walker(CONFIG)
+    conditions = Conditions(Scenario(seed=31_000, noise=SENSORS), (0.0, 0.0, 0.0), standing=True)
+    _, fell = walk(world, walker, conditions, np.zeros((4000, 3)), watch)
+    assert not fell and worst < 0.05
     assert world.truth.position[2] == pytest.approx(CONFIG.control.gait.walking_height, abs=0.01)
 
 

@@ -23,6 +23,8 @@ CANDIDATES = 4
 """Checkpoints that are compared: the last ones, evenly spread over the last stage."""
 DRAWS = 24
 """Episodes drawn at random, beside the measured walks and the pushes."""
+STANDING_TIME = 20.0
+"""s: what leans a little more every second has fallen by then."""
 VALIDATION_SEED = 5_000
 """Of the episodes that judge; apart from training's and from the table's."""
 
@@ -64,6 +66,8 @@ def validation_set(bounds: Randomization = TASK) -> tuple[list[Trial], list[Tria
         for phase in range(4)
         for side in (0.0, pi / 2, pi, -pi / 2)
     ]
+    standing = Conditions(Scenario(seed=VALIDATION_SEED, noise=SENSORS), (0.0, 0.0, 0.0), standing=True)
+    measured.append(Trial(standing, STANDING_TIME))
     rng = np.random.default_rng(VALIDATION_SEED)
     return measured, pushed + [Trial(draw(bounds, rng), 2.6) for _ in range(DRAWS)]
 

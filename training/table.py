@@ -118,7 +118,7 @@ def _grid(contest: Contest, who: Contender, size: Size, noise: Noise) -> Cells:
 
 def _stand(contest: Contest, who: Contender, size: Size) -> Cells:
     standing = [Conditions(_noisy(seed), (0.0, 0.0, 0.0), standing=True) for seed in range(size.seeds)]
-    outcomes = contest.play(who, [Trial(conditions, 5.0) for conditions in standing])
+    outcomes = contest.play(who, [Trial(conditions, 20.0) for conditions in standing])
     errors = np.array([outcome.height for outcome in outcomes]) - contest.walking_height
     return {"height error mm": 1e3 * float(np.abs(errors).max()), "falls": float(sum(o.fell for o in outcomes))}
 
