@@ -78,7 +78,7 @@ def test_every_shipped_policy_stands_for_as_long_as_one_likes(name: str, world: 
     walker = Contender(name, "policy", str(find_policy(name))).walker(CONFIG)
     conditions = Conditions(Scenario(seed=31_000, noise=SENSORS), (0.0, 0.0, 0.0), standing=True)
     _, fell = walk(world, walker, conditions, np.zeros((4000, 3)), watch)
-    assert not fell and worst < 0.05
+    assert not fell and worst < 0.15
     assert world.truth.position[2] == pytest.approx(CONFIG.control.gait.walking_height, abs=0.01)
 
 
