@@ -89,8 +89,11 @@ POLISH = msgspec.structs.replace(
     fall_weight=5.0, weight_decay=0.1,
 )  # fmt: skip
 """What was shed is won back, where it serves."""
-SETTLE = msgspec.structs.replace(POLISH, name="settle", iterations=120, conditions="weak", weight_decay=0.05, rest=True)
-"""From numbers that walk: what stands asks for nothing, and motors may be weak."""
+SETTLE = msgspec.structs.replace(
+    POLISH, name="settle", iterations=80, conditions="weak", learning_rate=0.007, learning_rate_end=0.0007,
+    weight_decay=0.05, rest=True,
+)  # fmt: skip
+"""From numbers that walk: what stands asks for nothing, and motors may be weak. Small steps keep what was polished."""
 ROUGHEN = msgspec.structs.replace(
     POLISH, name="roughen", iterations=80, directions=48, ticks=700, conditions="rough", learning_rate=0.04,
     learning_rate_end=0.004, rest=True,
