@@ -16,7 +16,7 @@ from sim.terrain import HeightField, Plane, Slope
 from training import pgpe, selection
 from training.checkpoint import Checkpoint, Row, RunFolder
 from training.contest import Contender, Outcome, Trial
-from training.plan import IMITATE, REFINE, ROUGHEN, StagePlan
+from training.plan import IMITATE, ROUGHEN, SETTLE, StagePlan
 from training.variants import VARIANTS, make_policy, with_parameters
 
 CONFIG = configuration.load(configuration.find_robot("stoch3"))
@@ -58,7 +58,7 @@ def _nearness(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selection, "Contest", NearnessContest)
 
 
-def selected(folder: RunFolder, stage: StagePlan = REFINE) -> tuple[Array, dict[str, object]]:
+def selected(folder: RunFolder, stage: StagePlan = SETTLE) -> tuple[Array, dict[str, object]]:
     policy = selection.select(CONFIG, folder, stage, 1, lambda _: None)
     return policy.parameters, policy.provenance
 
@@ -88,7 +88,7 @@ def test_a_run_of_one_checkpoint_keeps_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "grounds"), [(IMITATE, {Plane}), (REFINE, {Plane}), (ROUGHEN, {Plane, Slope, HeightField})]
+    ("stage", "grounds"), [(IMITATE, {Plane}), (SETTLE, {Plane}), (ROUGHEN, {Plane, Slope, HeightField})]
 )
 def test_the_ground_that_was_trained_on_judges(
     stage: StagePlan, grounds: set[type], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
