@@ -62,6 +62,19 @@ def test_forward_of_inverse_is_the_target_where_reached(offsets: list[tuple[floa
 
 
 @pytest.mark.parametrize("name", ROBOTS)
+def test_a_foot_drawn_past_its_hip_turns_the_thigh_without_a_jump(name: str) -> None:
+    """Where the shank is the longer one, the thigh of a folded leg goes beyond half a turn."""
+    known = robot(name).robot
+    feet = np.tile(known.hips, (400, 1, 1))
+    feet[:, :, 0] += np.linspace(0.1, -0.1, 400)[:, None]
+    feet[:, :, 1] += known.abduction_length * np.array([1.0, -1.0, 1.0, -1.0])
+    feet[:, :, 2] -= 0.01
+    geometry = leg_geometry(known)
+    hips = np.array([inverse(geometry, step)[0][:, 1] for step in feet])
+    assert np.abs(np.diff(hips, axis=0)).max() < 0.3
+
+
+@pytest.mark.parametrize("name", ROBOTS)
 def test_a_target_out_of_reach_is_answered_in_its_direction_at_full_length(name: str) -> None:
     body = robot(name).robot
     geometry = leg_geometry(body)

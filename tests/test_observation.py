@@ -17,7 +17,9 @@ PLACES = [("height", 0), ("roll", 1), ("pitch", 2), ("yaw", 3), ("velocity_x", 4
 
 
 def bench(reading: str, **changes: object) -> Workbench:
-    ones = variant(policy(), reading=reading, observation_scale=(1.0,) * 28, terms=Terms(**changes))
+    ones = variant(
+        policy(), reading=reading, observation_scale=(1.0,) * 28, observation_offset=(), terms=Terms(**changes)
+    )
     known = Workbench(chosen=ones)
     known.t.height, known.t.rpy = 0.6, (0.01, 0.02, 0.03)
     known.t.twist = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)

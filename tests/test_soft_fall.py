@@ -37,7 +37,7 @@ def test_a_robot_that_is_knocked_over_is_low_before_it_lands(side: float) -> Non
     hard, fast = knocked(side * 450.0, believed=False)
     assert next(fault.evidence.reason for fault in soft.cycle.faults) == "falling"
     assert "falling" not in [fault.evidence.reason for fault in hard.cycle.faults]
-    assert slow < 0.8 * fast
+    assert slow < 0.85 * fast
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

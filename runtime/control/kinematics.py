@@ -139,6 +139,8 @@ def angles_of_leg(g, leg, foot, q):  # type: ignore[no-untyped-def]
     cosine = min(1.0, max(-1.0, (length * length - l2 * l2 - l3 * l3) / (2.0 * l2 * l3)))
     along, across = l2 + l3 * cosine, -l3 * math.sqrt(1.0 - cosine * cosine)  # of the shank's end, seen from the thigh
     q[1] = math.atan2(-x * along - c * across, c * along - x * across)
+    if q[1] < -0.5 * math.pi:  # beyond half a turn backwards: the nearer stop is the upper one
+        q[1] += 2.0 * math.pi
     q[2] = -math.acos(cosine)
     return reached
 
