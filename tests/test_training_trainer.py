@@ -15,7 +15,7 @@ from runtime import policies
 from runtime.config import Config
 from runtime.control.policy import BALANCE_TERMS, Policy, ask, policy_record
 from training import checkpoint as checkpoints
-from training.checkpoint import Checkpoint, Row, RunError, RunFolder
+from training.checkpoint import Row, RunError, RunFolder
 from training.plan import RunPlan, StagePlan
 from training.provenance import config_hash, versions
 from training.reference import Reference, make_reference
@@ -291,9 +291,17 @@ def answer(policy: Policy, seen: Array) -> Array:
 
 
 def test_a_stage_that_rests_goes_on_with_the_same_trot(tmp_path: Path, config: Config, reference: Reference) -> None:
-    made = plan(config, FIRST, msgspec.structs.replace(SECOND, rest=True, symmetry="none"))
+    made = plan(
+        config,
+        FIRST,
+        msgspec.structs.replace(SECOND, rest=True, symmetry="none", learning_rate=1e-12, learning_rate_end=1e-12),
+    )
     trainer = begin(config, reference, tmp_path / "run", made)
     end = trainer.run(trainer.start(), lambda _: None)
-    first = Checkpoint(0, 4, trainer.folder.load(FIRST.iterations).state)
-    first_policy, last_policy = trainer.policy(first), trainer.policy(end)
-    assert first_policy.observation_offset == () and last_policy.observation_offset == ALL_DOWN
+    before = policies.load(trainer.folder.policy_file(FIRST.iterations), "stoch3")
+    after = trainer.policy(end)
+    assert before.observation_offset == () and after.observation_offset == ALL_DOWN
+    seen = np.random.default_rng(3).standard_normal(28)
+    for feet in ([1, 0, 0, 1], [0, 1, 1, 0]):
+        seen[10:14] = seen[24:28] = feet
+        np.testing.assert_allclose(answer(before, seen), answer(after, seen), atol=1e-8)

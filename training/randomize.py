@@ -125,15 +125,15 @@ def draw(bounds: Randomization, rng: np.random.Generator) -> Conditions:
     if bounds.weak_share < 1.0 and rng.random() >= bounds.weak_share:
         scenario = replace(scenario, motor_strength=1.0)
     if bounds.standing_share > 0.0 and rng.random() < bounds.standing_share:
-        return Conditions(replace(scenario, pushes=_softened(scenario.pushes)), (0.0, 0.0, 0.0), standing=True)
+        return Conditions(
+            replace(scenario, pushes=tuple(map(_softened, scenario.pushes))), (0.0, 0.0, 0.0), standing=True
+        )
     return Conditions(scenario, command)
 
 
-def _softened(pushes: tuple[Push, ...]) -> tuple[Push, ...]:
-    def softer(force: tuple[float, float, float]) -> tuple[float, float, float]:
-        return STANDING_PUSH * force[0], STANDING_PUSH * force[1], STANDING_PUSH * force[2]
-
-    return tuple(replace(push, force=softer(push.force)) for push in pushes)
+def _softened(push: Push) -> Push:
+    x, y, z = (STANDING_PUSH * axis for axis in push.force)
+    return replace(push, force=(x, y, z))
 
 
 def _draw_terrain(bounds: Randomization, rng: np.random.Generator) -> Terrain:
