@@ -131,6 +131,7 @@ class PlainController:
         self.stance, self.phase, self.clock = np.ones(4, bool), np.full(4, np.pi), 1.0 - 1e-9
         self.started, self.first_height = False, True
         self.position, self.slope, self.rested = zero(3), zero(2), zero(4)
+        self.met_ground = zero(4, bool)
         self.followed, self.integral, self.walked, self.heading = zero(3), zero(2), 0.0, 0.0
         self.previous: Array | None = None
         self.shifts, self.depth, self.gain = zero(12), zero(4), np.ones(4)
@@ -254,7 +255,8 @@ class PlainController:
         self.footholds = np.where(resting[:, None], self.position + self.x[1:], self.footholds)
         spread = (self.footholds - self.footholds.mean(axis=0)) @ about_z(yaw)
         moments = spread[:, :2].T @ spread[:, :2]
-        if np.linalg.det(moments) > 0.01 * np.trace(moments) ** 2:
+        self.met_ground |= resting
+        if self.met_ground.all() and np.linalg.det(moments) > 0.01 * np.trace(moments) ** 2:
             raw = np.clip(np.linalg.solve(moments, spread[:, :2].T @ spread[:, 2]), -0.4, 0.4)
             follow = self.dt / (self.dt + self.config.estimator.slope_time_constant)
             self.slope = self.slope + (raw - self.slope) * follow

@@ -152,6 +152,16 @@ def test_slope_of_the_plane_through_the_footholds(grade: tuple[float, float]) ->
     np.testing.assert_allclose(known.record["slope"][0], grade, atol=2e-3)
 
 
+def test_four_feet_in_the_air_under_a_tilted_body_span_no_slope() -> None:
+    tilted = standing(rpy=(0.15, -0.2, 0.0))
+    air = measurement(tilted.joints.position, rpy=(0.15, -0.2, 0.0))
+    known = settled(air, 100)
+    np.testing.assert_array_equal(known.record["slope"][0], 0.0)
+    for _ in range(200):
+        known.estimate(on_the_ground((0.0, 0.0, 0.53), (0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(known.record["slope"][0], 0.0, atol=2e-3)
+
+
 def test_covariance_stays_symmetric_and_positive() -> None:
     rng = np.random.default_rng(0)
     known = settled(standing(), 5)

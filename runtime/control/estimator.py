@@ -137,6 +137,7 @@ def _start(p, s, in_world):  # type: ignore[no-untyped-def]
         s.covariance[leg + 1, leg + 1] = p.foot_position_noise**2
     s.height = p.walking_height
     s.rested[:] = p.settling_time
+    s.met_ground[:] = 0
     for leg in range(4):
         for i in range(3):
             s.footholds[leg, i] = s.position[i] + in_world[leg, i]
@@ -197,11 +198,15 @@ def _update(p, s, m, leg):  # type: ignore[no-untyped-def]
 
 @compiled
 def _slope(p, s, t, c, sn):  # type: ignore[no-untyped-def]
-    """Low-passed gradient of the plane through the last foothold of every foot, heading frame."""
+    """Low-passed gradient of the plane through the last foothold of every foot, heading frame.
+
+    Nothing is known of it before every foot has rested: four feet in the air under a tilted body span no ground.
+    """
     xx, xy, yy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
     middle_x, middle_y, middle_z = 0.0, 0.0, 0.0
     for leg in range(4):
         if s.rested[leg] > p.settling_time:
+            s.met_ground[leg] = 1
             for i in range(3):
                 s.footholds[leg, i] = s.position[i] + s.support[leg, i]
         middle_x += 0.25 * s.footholds[leg, 0]
@@ -214,7 +219,7 @@ def _slope(p, s, t, c, sn):  # type: ignore[no-untyped-def]
         xx, xy, yy, xz, yz = xx + x * x, xy + x * y, yy + y * y, xz + x * dz, yz + y * dz
     determinant = xx * yy - xy * xy
     follow = p.dt / (p.dt + p.slope_time_constant)
-    if determinant > 0.01 * (xx + yy) ** 2:
+    if s.met_ground.all() and determinant > 0.01 * (xx + yy) ** 2:
         for i in range(2):
             raw = (yy * xz - xy * yz) / determinant if i == 0 else (xx * yz - xy * xz) / determinant
             raw = min(STEEPEST, max(-STEEPEST, raw))

@@ -64,6 +64,7 @@ STATE_DTYPE = np.dtype(
         ("height", "f8"),
         ("position", "f8", (3,)),
         ("footholds", "f8", (4, 3)),  # where each foot last rested, dead-reckoned world, m
+        ("met_ground", "u1", (4,)),  # feet that have rested since the start
         ("slope", "f8", (2,)),
         # command
         ("followed", "f8", (3,)),  # velocity command after its acceleration bound
