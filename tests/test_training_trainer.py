@@ -13,7 +13,7 @@ from drivers.robot import Array
 from runtime import config as configuration
 from runtime import policies
 from runtime.config import Config
-from runtime.control.policy import BALANCE_TERMS, Policy, ask, policy_record
+from runtime.control.policy import Policy, ask, policy_record
 from training import checkpoint as checkpoints
 from training.checkpoint import Row, RunError, RunFolder
 from training.plan import RunPlan, StagePlan
@@ -21,7 +21,16 @@ from training.provenance import config_hash, versions
 from training.reference import Reference, make_reference
 from training.rollout import Episode, Setup, Task
 from training.trainer import Trainer
-from training.variants import ALL_DOWN, VARIANTS, folding_of, make_policy, reading_contacts, with_parameters
+from training.variants import (
+    ALL_DOWN,
+    TRAINED_TERMS,
+    VARIANTS,
+    folding_of,
+    make_policy,
+    raising_feet,
+    reading_contacts,
+    with_parameters,
+)
 
 FIRST = StagePlan(name="first", reward="table", iterations=4, directions=6, ticks=50, conditions="nominal")
 SECOND = StagePlan(
@@ -262,7 +271,7 @@ def test_the_papers_letter_has_no_fixed_terms(config: Config) -> None:
 def test_a_run_without_a_term_makes_policies_without_it(tmp_path: Path, config: Config, reference: Reference) -> None:
     made = msgspec.structs.replace(plan(config), without=("capture_point",))
     trainer = begin(config, reference, tmp_path / "run", made)
-    assert trainer.policy(trainer.start()).terms == msgspec.structs.replace(BALANCE_TERMS, capture_point=0.0)
+    assert trainer.policy(trainer.start()).terms == msgspec.structs.replace(TRAINED_TERMS, capture_point=0.0)
 
 
 @pytest.mark.parametrize("name", ["linear", "mlp"])
@@ -281,6 +290,37 @@ def test_contacts_read_from_four_feet_down_leave_the_trot_and_rest_when_it_stand
     assert np.abs(answer(before, still)).max() > 0
     back = reading_contacts(after, False)
     np.testing.assert_allclose(back.parameters, before.parameters)
+
+
+@pytest.mark.parametrize("name", ["linear", "mlp"])
+def test_contacts_read_by_another_scale_answer_the_same(config: Config, name: str) -> None:
+    rng = np.random.default_rng(4)
+    made = make_policy(config.robot, config.control.gait.walking_height, VARIANTS[name], terms=True)
+    before = with_parameters(made, rng.standard_normal(made.parameters.size))
+    after = reading_contacts(before, False, 0.4)
+    assert (
+        after.observation_scale[10:14] == (0.4,) * 4 and after.observation_scale[:10] == before.observation_scale[:10]
+    )
+    seen = rng.standard_normal(28)
+    np.testing.assert_allclose(answer(before, seen), answer(after, seen))
+
+
+@pytest.mark.parametrize("rest", [False, True])
+def test_raised_feet_swing_higher_and_nothing_changes_at_rest(config: Config, rest: bool) -> None:
+    made = make_policy(config.robot, config.control.gait.walking_height, VARIANTS["linear"], terms=True)
+    raised = raising_feet(reading_contacts(made, rest), 0.04)
+    seen = np.zeros(28)
+    seen[10:14] = seen[24:28] = 1.0
+    np.testing.assert_allclose(answer(raised, seen), 0.0, atol=1e-12)
+    for feet, shifts in (([1, 0, 0, 1], [-0.04, 0.04, 0.04, -0.04]), ([0, 1, 1, 0], [0.04, -0.04, -0.04, 0.04])):
+        seen[10:14] = seen[24:28] = feet
+        asked = answer(raised, seen)
+        np.testing.assert_allclose(asked[2:12:3], shifts)
+        np.testing.assert_array_equal(np.delete(asked, [2, 5, 8, 11]), 0.0)
+    folding = folding_of(raised, "both")
+    np.testing.assert_allclose(folding.unfold(folding.fold(raised.parameters)), raised.parameters)
+    with pytest.raises(policies.PolicyError, match="linear"):
+        raising_feet(make_policy(config.robot, 0.57, VARIANTS["mlp"], terms=True), 0.04)
 
 
 def answer(policy: Policy, seen: Array) -> Array:

@@ -23,7 +23,15 @@ from training.reference import Reference
 from training.reward import TableReward, TaskReward
 from training.rollout import Episode, Setup, Task
 from training.symmetry import Folding
-from training.variants import VARIANTS, folding_of, make_policy, reading_contacts, with_parameters, without_terms
+from training.variants import (
+    VARIANTS,
+    folding_of,
+    make_policy,
+    raising_feet,
+    reading_contacts,
+    with_parameters,
+    without_terms,
+)
 
 MakeEvaluator = Callable[[Setup], Evaluator]
 Report = Callable[[Row], None]
@@ -141,7 +149,9 @@ class Trainer:
 
     def _enter(self, number: int, start: Policy) -> pgpe.State:
         course = self._courses[number]
-        read = reading_contacts(start, course.plan.rest)
+        read = reading_contacts(start, course.plan.rest, course.plan.contact_scale)
+        if course.plan.swing_lift:
+            read = raising_feet(read, course.plan.swing_lift)
         return pgpe.start(course.folding.fold(read.parameters), course.plan.stdev)
 
     def _course(self, stage: StagePlan, template: Policy) -> _Course:
@@ -153,7 +163,7 @@ class Trainer:
             stdev_learning_rate=stage.stdev_learning_rate,
             weight_decay=stage.weight_decay,
         )
-        template = reading_contacts(template, stage.rest)
+        template = reading_contacts(template, stage.rest, stage.contact_scale)
         return _Course(stage, template, folding_of(template, stage.symmetry), params)
 
     def _policy_file(self, checkpoint: Checkpoint) -> bytes:

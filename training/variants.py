@@ -26,8 +26,16 @@ from training.symmetry import (
     no_folding,
 )
 
+TRAINED_TERMS = msgspec.structs.replace(BALANCE_TERMS, capture_point=0.16, velocity_error_bound=0.6)
+"""The fixed terms around what is trained, and around the MPC with the same: a learnt matrix has use for a larger error
+than the hand-built one."""
+SHIFT_TIME_CONSTANT = 0.03
+"""Of what is trained, s."""
 ALL_DOWN = 2 * ((0.0,) * 10 + (1.0,) * 4)
 """Offset of an observation in which only feet in the air are seen."""
+CONTACT_SCALE = 0.1
+"""Of the contacts in the observation, where a stage does not say otherwise."""
+_CONTACTS = [10, 11, 12, 13, 24, 25, 26, 27]
 HIDDEN = 16
 """Neurons of the small fully-connected variant."""
 SYMMETRIES = {"none": (), "left-right": (LEFT_RIGHT,), "both": (LEFT_RIGHT, FRONT_BACK)}
@@ -101,7 +109,8 @@ def make_policy(
         action_names=names,
         action_scale=tuple(scale.tolist()),
         action_bound=tuple(bound.tolist()),
-        terms=BALANCE_TERMS if terms else Terms(),
+        shift_time_constant=SHIFT_TIME_CONSTANT if terms else like.shift_time_constant,
+        terms=TRAINED_TERMS if terms else Terms(),
         matrix=() if variant.hidden else _rows(readout),
         hidden=_rows(hidden) if variant.hidden else (),
         readout=_rows(readout) if variant.hidden else (),
@@ -121,21 +130,44 @@ def with_parameters(policy: Policy, parameters: Array) -> Policy:
     )
 
 
-def reading_contacts(policy: Policy, all_down: bool) -> Policy:
-    """The same trot from a policy that reads the contacts less ``ALL_DOWN``, or as they are.
+def reading_contacts(policy: Policy, all_down: bool, scale: float = CONTACT_SCALE) -> Policy:
+    """The same trot from a policy that reads the contacts less ``ALL_DOWN``, or as they are, by ``scale``.
 
     Each number changes so that with two feet on the ground, whichever diagonal, the same is answered as before; with
-    four, all of it is new (decision 14).
+    four, all of it is new if the offset is (decision 14). The larger the scale, the faster the contacts' numbers learn.
     """
     wanted = ALL_DOWN if all_down else ()
-    if policy.observation_offset == wanted:
+    scales = np.array(policy.observation_scale)
+    if policy.observation_offset == wanted and (scales[_CONTACTS] == scale).all():
         return policy
     layer = np.array(policy.matrix or policy.hidden)
-    for first in (10, 24):
+    layer[:, _CONTACTS] *= scales[_CONTACTS] / scale
+    scales[_CONTACTS] = scale
+    for first in (10, 24) if policy.observation_offset != wanted else ():
         feet = layer[:, first : first + 4]
         feet -= 0.5 * feet.sum(axis=1, keepdims=True)
-    read = msgspec.structs.replace(policy, observation_offset=wanted)
+    read = msgspec.structs.replace(policy, observation_offset=wanted, observation_scale=tuple(scales.tolist()))
     return msgspec.structs.replace(read, **{"matrix" if policy.matrix else "hidden": _rows(layer)})
+
+
+def raising_feet(policy: Policy, lift: float) -> Policy:
+    """The same linear policy, but in a trot feet in the air aim higher by ``lift`` m, those on the ground lower.
+
+    Each foot's z shift reads the other diagonal's contacts less its own, so with four feet down nothing changes.
+
+    Raises:
+        PolicyError: the policy has a hidden layer.
+    """
+    if not policy.matrix:
+        raise PolicyError(f"{policy.name}: only a linear policy's feet can be raised by its numbers")
+    rows = np.array(policy.matrix)
+    for foot, diagonal in enumerate((0, 1, 1, 0)):
+        row = policy.action_names.index(SHIFT_NAMES[3 * foot + 2])
+        for other, its in enumerate((0, 1, 1, 0)):
+            column = 10 + other
+            side = 0.5 if its != diagonal else -0.5
+            rows[row, column] += side * lift / policy.observation_scale[column] / policy.action_scale[row]
+    return msgspec.structs.replace(policy, matrix=_rows(rows))
 
 
 def folding_of(policy: Policy, symmetry: str) -> Folding:
