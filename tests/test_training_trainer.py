@@ -13,7 +13,7 @@ from drivers.robot import Array
 from runtime import config as configuration
 from runtime import policies
 from runtime.config import Config
-from runtime.control.policy import Policy, ask, policy_record
+from runtime.control.policy import BALANCE_TERMS, Policy, ask, policy_record
 from training import checkpoint as checkpoints
 from training.checkpoint import Row, RunError, RunFolder
 from training.plan import RunPlan, StagePlan
@@ -23,7 +23,6 @@ from training.rollout import Episode, Setup, Task
 from training.trainer import Trainer
 from training.variants import (
     ALL_DOWN,
-    TRAINED_TERMS,
     VARIANTS,
     folding_of,
     make_policy,
@@ -271,7 +270,7 @@ def test_the_papers_letter_has_no_fixed_terms(config: Config) -> None:
 def test_a_run_without_a_term_makes_policies_without_it(tmp_path: Path, config: Config, reference: Reference) -> None:
     made = msgspec.structs.replace(plan(config), without=("capture_point",))
     trainer = begin(config, reference, tmp_path / "run", made)
-    assert trainer.policy(trainer.start()).terms == msgspec.structs.replace(TRAINED_TERMS, capture_point=0.0)
+    assert trainer.policy(trainer.start()).terms == msgspec.structs.replace(BALANCE_TERMS, capture_point=0.0)
 
 
 @pytest.mark.parametrize("name", ["linear", "mlp"])
