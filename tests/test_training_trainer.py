@@ -23,8 +23,6 @@ from training.rollout import Episode, Setup, Task
 from training.trainer import Trainer
 from training.variants import (
     ALL_DOWN,
-    EAGER_SHIFTS,
-    TRAINED_TERMS,
     VARIANTS,
     folding_of,
     make_policy,
@@ -291,20 +289,6 @@ def test_contacts_read_from_four_feet_down_leave_the_trot_and_rest_when_it_stand
     assert np.abs(answer(before, still)).max() > 0
     back = reading_contacts(after, False)
     np.testing.assert_allclose(back.parameters, before.parameters)
-
-
-def test_a_stage_for_what_walks_already_has_the_eager_terms(
-    tmp_path: Path, config: Config, reference: Reference
-) -> None:
-    made = plan(config, FIRST, msgspec.structs.replace(SECOND, eager=True, symmetry="none"))
-    trainer = begin(config, reference, tmp_path / "run", made)
-    assert trainer.policy(trainer.start()).terms == BALANCE_TERMS
-    after = trainer.policy(trainer.run(trainer.start(), quiet))
-    assert after.terms == TRAINED_TERMS and after.shift_time_constant == EAGER_SHIFTS
-    paper = begin(config, reference, tmp_path / "paper", msgspec.structs.replace(made, terms=False))
-    letter = paper.policy(paper.start())
-    end = paper.policy(paper.run(paper.start(), quiet))
-    assert letter.terms == end.terms and end.shift_time_constant == letter.shift_time_constant
 
 
 @pytest.mark.parametrize("name", ["linear", "mlp"])

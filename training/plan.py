@@ -28,8 +28,6 @@ class StagePlan(Record, frozen=True, kw_only=True):
     conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "wide", "weak", "rough"] = "imitation"
     """Bounds of the draws: ``training.randomize.SETS``."""
     symmetry: Literal["none", "left-right", "both"] = "left-right"
-    eager: bool = False
-    """The fixed terms answer larger errors, sooner (``training.variants.TRAINED_TERMS``): for what walks already."""
     rest: bool = False
     """Contacts are read less four feet on the ground, so that who stands asks for nothing (decision 14)."""
     contact_scale: Positive = CONTACT_SCALE
@@ -93,7 +91,7 @@ SHED = msgspec.structs.replace(
 """Numbers that grew while nothing asked for them make a robot fall that is pushed hard: they fade here."""
 POLISH = msgspec.structs.replace(
     SERVE, name="polish", iterations=180, directions=64, stdev=0.04, learning_rate=0.02, learning_rate_end=0.001,
-    fall_weight=5.0, weight_decay=0.1, eager=True,
+    fall_weight=5.0, weight_decay=0.1,
 )  # fmt: skip
 """What was shed is won back, where it serves."""
 SETTLE = msgspec.structs.replace(

@@ -74,10 +74,13 @@ class Trainer:
         """
         self.config, self.plan, self.folder = config, plan, folder
         self._make_evaluator, self._reference = make_evaluator, reference
-        self._courses = [self._course(stage) for stage in plan.stages]
+        height = config.control.gait.walking_height
+        shape = make_policy(config.robot, height, VARIANTS[plan.variant], plan.terms, plan.name)
+        template = declared(without_terms(shape, plan.without), config)
+        self._first = template if first is None else first
+        self._courses = [self._course(stage, template) for stage in plan.stages]
         self.template: Policy = self._courses[0].template
         """The first stage's policies but for their numbers."""
-        self._first = self.template if first is None else first
 
     def start(self) -> Checkpoint:
         """The run before its first iteration, saved."""
@@ -151,7 +154,7 @@ class Trainer:
             read = raising_feet(read, course.plan.swing_lift)
         return pgpe.start(course.folding.fold(read.parameters), course.plan.stdev)
 
-    def _course(self, stage: StagePlan) -> _Course:
+    def _course(self, stage: StagePlan, template: Policy) -> _Course:
         params = pgpe.Params(
             directions=stage.directions,
             learning_rate=stage.learning_rate,
@@ -160,14 +163,8 @@ class Trainer:
             stdev_learning_rate=stage.stdev_learning_rate,
             weight_decay=stage.weight_decay,
         )
-        template = reading_contacts(self._shape(stage), stage.rest, stage.contact_scale)
+        template = reading_contacts(template, stage.rest, stage.contact_scale)
         return _Course(stage, template, folding_of(template, stage.symmetry), params)
-
-    def _shape(self, stage: StagePlan) -> Policy:
-        """The stage's policies but for their numbers and for how they read contacts."""
-        plan, height = self.plan, self.config.control.gait.walking_height
-        shape = make_policy(self.config.robot, height, VARIANTS[plan.variant], plan.terms, plan.name, eager=stage.eager)
-        return declared(without_terms(shape, plan.without), self.config)
 
     def _policy_file(self, checkpoint: Checkpoint) -> bytes:
         return encode_policy(self.policy(checkpoint))

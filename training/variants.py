@@ -26,11 +26,6 @@ from training.symmetry import (
     no_folding,
 )
 
-TRAINED_TERMS = msgspec.structs.replace(BALANCE_TERMS, capture_point=0.16, velocity_error_bound=0.6)
-"""The fixed terms around what walks already, and around the MPC with the same; what learns from nothing stands longer
-with the hand-built matrix's."""
-EAGER_SHIFTS = 0.03
-"""Low-pass of its shifts, s."""
 ALL_DOWN = 2 * ((0.0,) * 10 + (1.0,) * 4)
 """Offset of an observation in which only feet in the air are seen."""
 CONTACT_SCALE = 0.1
@@ -87,17 +82,9 @@ def without_terms(policy: Policy, names: Collection[Term]) -> Policy:
 
 
 def make_policy(
-    description: RobotDescription,
-    walking_height: float,
-    variant: Variant,
-    terms: bool,
-    name: str = "untrained",
-    eager: bool = True,
+    description: RobotDescription, walking_height: float, variant: Variant, terms: bool, name: str = "untrained"
 ) -> Policy:
-    """A policy of this shape with all readout numbers zero.
-
-    ``terms`` turns the fixed terms on: ``TRAINED_TERMS``, or where it is not ``eager`` those of the hand-built matrix.
-    """
+    """A policy of this shape with all readout numbers zero; ``terms`` turns the fixed terms on."""
     like = balance_policy(description, walking_height)
     scale, bound = np.array(like.action_scale), np.array(like.action_bound)
     names = like.action_names
@@ -117,8 +104,7 @@ def make_policy(
         action_names=names,
         action_scale=tuple(scale.tolist()),
         action_bound=tuple(bound.tolist()),
-        shift_time_constant=EAGER_SHIFTS if terms and eager else like.shift_time_constant,
-        terms=(TRAINED_TERMS if eager else BALANCE_TERMS) if terms else Terms(),
+        terms=BALANCE_TERMS if terms else Terms(),
         matrix=() if variant.hidden else _rows(readout),
         hidden=_rows(hidden) if variant.hidden else (),
         readout=_rows(readout) if variant.hidden else (),
