@@ -25,7 +25,7 @@ class StagePlan(Record, frozen=True, kw_only=True):
     iterations: Count
     directions: Count = 64
     ticks: Count = 1000
-    conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "wide", "weak", "rough"] = "imitation"
+    conditions: Literal["nominal", "paper", "noisy", "imitation", "task", "wide", "weak", "hard", "rough"] = "imitation"
     """Bounds of the draws: ``training.randomize.SETS``."""
     symmetry: Literal["none", "left-right", "both"] = "left-right"
     rest: bool = False
@@ -99,6 +99,10 @@ SETTLE = msgspec.structs.replace(
     learning_rate_end=0.0008, weight_decay=0.05, rest=True, contact_scale=0.2,
 )  # fmt: skip
 """From numbers that walk: what stands asks for nothing, and motors may be weak. Small steps keep what was polished."""
+HARDEN = msgspec.structs.replace(
+    SETTLE, name="harden", iterations=40, conditions="hard", learning_rate=0.005, learning_rate_end=0.0005,
+)  # fmt: skip
+"""What little friction and a hard torque clip still take down."""
 ROUGHEN = msgspec.structs.replace(
     POLISH, name="roughen", iterations=60, directions=48, ticks=800, conditions="rough", learning_rate=0.015,
     learning_rate_end=0.0015, rest=True, contact_scale=0.4, swing_lift=0.04,
@@ -122,10 +126,10 @@ def make_plan(
 ) -> RunPlan:
     """The plan of a ``trotd train`` from nothing, from a policy's numbers, by the paper's letter or on rough ground."""
     stages: tuple[StagePlan, ...] = (
-        (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, SHED, POLISH, SETTLE)
+        (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, SHED, POLISH, SETTLE, HARDEN)
     )
     if start and not paper and not rough:
-        stages = (SETTLE,)
+        stages = (SETTLE, HARDEN)
     if variant.endswith("plain"):  # commands mean nothing to it: it can only imitate one
         stages = tuple(stage for stage in stages if stage.reward == "table") or stages
     return msgspec.convert(
