@@ -108,6 +108,10 @@ ROUGHEN = msgspec.structs.replace(
     learning_rate_end=0.0015, rest=True, contact_scale=0.4, swing_lift=0.04,
 )  # fmt: skip
 """The same on uneven ground, which takes longer to cross."""
+RAISE = msgspec.structs.replace(
+    ROUGHEN, name="raise", iterations=8, learning_rate=0.003, learning_rate_end=0.0003, swing_lift=0.015,
+)  # fmt: skip
+"""What that took back of the feet's height is given again, and a little more."""
 PAPER = StagePlan(name="imitate", reward="table", iterations=60, conditions="imitation", symmetry="none")
 """Section IV.B: 64 directions, 1000 ticks, 60 iterations; with the sensors' noise, without which nothing transfers."""
 
@@ -126,7 +130,7 @@ def make_plan(
 ) -> RunPlan:
     """The plan of a ``trotd train`` from nothing, from a policy's numbers, by the paper's letter or on rough ground."""
     stages: tuple[StagePlan, ...] = (
-        (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, SHED, POLISH, SETTLE, HARDEN)
+        (PAPER,) if paper else (ROUGHEN, RAISE) if rough else (IMITATE, SERVE, SHED, POLISH, SETTLE, HARDEN)
     )
     if start and not paper and not rough:
         stages = (SETTLE, HARDEN)
