@@ -14,7 +14,7 @@ from station.push import active
 from trotd.cli import app
 
 RUN = ["--iterations", "1", "--directions", "1", "--ticks", "40", "--no-validate", "--workers", "1"]
-STAGES = 5
+STAGES = 6
 """Of a run from zero: so many iterations are played where each has one."""
 
 
