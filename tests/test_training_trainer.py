@@ -297,9 +297,8 @@ def test_contacts_read_by_another_scale_answer_the_same(config: Config, name: st
     made = make_policy(config.robot, config.control.gait.walking_height, VARIANTS[name], terms=True)
     before = with_parameters(made, rng.standard_normal(made.parameters.size))
     after = reading_contacts(before, False, 0.4)
-    assert (
-        after.observation_scale[10:14] == (0.4,) * 4 and after.observation_scale[:10] == before.observation_scale[:10]
-    )
+    assert after.observation_scale[10:14] == (0.4,) * 4
+    assert after.observation_scale[:10] == before.observation_scale[:10]
     seen = rng.standard_normal(28)
     np.testing.assert_allclose(answer(before, seen), answer(after, seen))
 
