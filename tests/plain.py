@@ -377,7 +377,7 @@ class PlainController:
             if self.swinging[leg]:
                 left = max(dt, swing_time * (1 - self.phase[leg] / np.pi))
                 xy = xy + (touchdown[leg] - xy) * dt / left
-                z = ground + gait.swing_height * np.sin(self.phase[leg])
+                z = ground + (gait.swing_height + self.policy.terms.swing_lift) * np.sin(self.phase[leg])
             else:
                 xy = xy - velocity_at(xy) * dt
                 deeper = min(gait.search_depth, self.depth[leg] + gait.search_speed * dt)

@@ -137,6 +137,7 @@ ALL_ON = Terms(
     centripetal=0.7,
     slope_feet=0.9,
     slope_body=0.4,
+    swing_lift=0.05,
 )
 
 

@@ -26,7 +26,6 @@ from training.variants import (
     VARIANTS,
     folding_of,
     make_policy,
-    raising_feet,
     reading_contacts,
     with_parameters,
 )
@@ -303,22 +302,14 @@ def test_contacts_read_by_another_scale_answer_the_same(config: Config, name: st
     np.testing.assert_allclose(answer(before, seen), answer(after, seen))
 
 
-@pytest.mark.parametrize("rest", [False, True])
-def test_raised_feet_swing_higher_and_nothing_changes_at_rest(config: Config, rest: bool) -> None:
-    made = make_policy(config.robot, config.control.gait.walking_height, VARIANTS["linear"], terms=True)
-    raised = raising_feet(reading_contacts(made, rest), 0.04)
-    seen = np.zeros(28)
-    seen[10:14] = seen[24:28] = 1.0
-    np.testing.assert_allclose(answer(raised, seen), 0.0, atol=1e-12)
-    for feet, shifts in (([1, 0, 0, 1], [-0.04, 0.04, 0.04, -0.04]), ([0, 1, 1, 0], [0.04, -0.04, -0.04, 0.04])):
-        seen[10:14] = seen[24:28] = feet
-        asked = answer(raised, seen)
-        np.testing.assert_allclose(asked[2:12:3], shifts)
-        np.testing.assert_array_equal(np.delete(asked, [2, 5, 8, 11]), 0.0)
-    folding = folding_of(raised, "both")
-    np.testing.assert_allclose(folding.unfold(folding.fold(raised.parameters)), raised.parameters)
-    with pytest.raises(policies.PolicyError, match="linear"):
-        raising_feet(make_policy(config.robot, 0.57, VARIANTS["mlp"], terms=True), 0.04)
+def test_a_stage_that_swings_higher_says_so_in_its_policies(
+    config: Config, reference: Reference, tmp_path: Path
+) -> None:
+    higher = msgspec.structs.replace(SECOND, swing_lift=0.05)
+    trainer = begin(config, reference, tmp_path, plan(config, FIRST, higher))
+    trainer.run(trainer.start(), quiet)
+    lifts = [policies.load(trainer.folder.policy_file(number), "stoch3").terms.swing_lift for number in (4, 5, 7)]
+    assert lifts == [0.0, 0.05, 0.05]
 
 
 def answer(policy: Policy, seen: Array) -> Array:

@@ -71,6 +71,12 @@ def test_swing_rises_to_its_height_and_returns_to_the_ground() -> None:
     assert path[-1, 2] == pytest.approx(ground, abs=0.008)
 
 
+def test_a_policy_may_swing_its_feet_higher() -> None:
+    known = bench(swing_lift=0.04)
+    ground = robot().robot.foot_radius - known.config.gait.walking_height
+    assert swing(known)[:, 2].max() == pytest.approx(ground + known.config.gait.swing_height + 0.04, abs=1e-4)
+
+
 def test_stance_moves_against_the_commanded_velocity_at_the_foot() -> None:
     known = bench((0.5, 0.2, 0.6))
     before = known.s.foot_targets.copy()

@@ -33,8 +33,7 @@ class StagePlan(Record, frozen=True, kw_only=True):
     contact_scale: Positive = CONTACT_SCALE
     """Of the contacts in the observation: ten times as large learns them ten times as fast."""
     swing_lift: NonNegative = 0.0
-    """m by which the first mean's feet swing higher (``training.variants.raising_feet``): where feet get caught, falls
-    are too rare a sign to learn it by."""
+    """m by which feet swing higher than the gait says (``policy.Terms``): falls are too rare a sign to learn it by."""
     stdev: Positive = 0.1
     stdev_learning_rate: NonNegative = 0.1
     learning_rate: Positive = 0.05
@@ -80,7 +79,7 @@ IMITATE = StagePlan(
 )  # fmt: skip
 """From nothing to a walk, with the paper's 64 directions: with 32, one seed of five does not pass the teacher."""
 SERVE = StagePlan(
-    name="serve", reward="task", iterations=40, directions=48, ticks=520, conditions="task", symmetry="both",
+    name="serve", reward="task", iterations=40, ticks=520, conditions="task", symmetry="both",
     stdev=0.05, stdev_learning_rate=0.0, learning_rate=0.03, learning_rate_end=0.01, fall_weight=2.5,
 )  # fmt: skip
 """From a walk to one that follows commands and takes pushes."""
@@ -90,7 +89,7 @@ SHED = msgspec.structs.replace(
 )  # fmt: skip
 """Numbers that grew while nothing asked for them make a robot fall that is pushed hard: they fade here."""
 POLISH = msgspec.structs.replace(
-    SERVE, name="polish", iterations=180, directions=64, stdev=0.04, learning_rate=0.02, learning_rate_end=0.001,
+    SERVE, name="polish", iterations=180, stdev=0.04, learning_rate=0.02, learning_rate_end=0.001,
     fall_weight=5.0, weight_decay=0.1,
 )  # fmt: skip
 """What was shed is won back, where it serves."""
@@ -105,13 +104,9 @@ HARDEN = msgspec.structs.replace(
 """What little friction and a hard torque clip still take down."""
 ROUGHEN = msgspec.structs.replace(
     POLISH, name="roughen", iterations=60, directions=48, ticks=800, conditions="rough", learning_rate=0.015,
-    learning_rate_end=0.0015, rest=True, contact_scale=0.4, swing_lift=0.04,
+    learning_rate_end=0.0015, rest=True, contact_scale=0.2, swing_lift=0.05,
 )  # fmt: skip
 """The same on uneven ground, which takes longer to cross."""
-RAISE = msgspec.structs.replace(
-    ROUGHEN, name="raise", iterations=8, learning_rate=0.003, learning_rate_end=0.0003, swing_lift=0.015,
-)  # fmt: skip
-"""What that took back of the feet's height is given again, and a little more."""
 PAPER = StagePlan(name="imitate", reward="table", iterations=60, conditions="imitation", symmetry="none")
 """Section IV.B: 64 directions, 1000 ticks, 60 iterations; with the sensors' noise, without which nothing transfers."""
 
@@ -130,7 +125,7 @@ def make_plan(
 ) -> RunPlan:
     """The plan of a ``trotd train`` from nothing, from a policy's numbers, by the paper's letter or on rough ground."""
     stages: tuple[StagePlan, ...] = (
-        (PAPER,) if paper else (ROUGHEN, RAISE) if rough else (IMITATE, SERVE, SHED, POLISH, SETTLE, HARDEN)
+        (PAPER,) if paper else (ROUGHEN,) if rough else (IMITATE, SERVE, SHED, POLISH, SETTLE, HARDEN)
     )
     if start and not paper and not rough:
         stages = (SETTLE, HARDEN)

@@ -95,7 +95,7 @@ HARD = replace(WEAK, friction=(0.3, 1.2), weak_share=0.25)
 ROUGH = Randomization(
     tilt=0.2, friction=(0.6, 1.2), noise=True, push_probability=0.4, push_impulse=(10.0, 35.0), push_time=(0.6, 2.5),
     bump=0.1, bump_spacing=(0.1, 0.2), slope=0.2, level_share=0.15,
-    velocity_x=(-0.3, 1.0), velocity_y=0.3, yaw_rate=0.8, zeroed_axes=0.25,
+    velocity_x=(-0.3, 1.0), velocity_y=0.3, yaw_rate=0.8, zeroed_axes=0.25, standing_share=0.1,
 )  # fmt: skip
 """Fine-tuning on height fields, beyond the paper's ±5 cm: up to ±10 cm within 10 to 20."""
 SETS = {

@@ -27,8 +27,8 @@ from training.variants import (
     VARIANTS,
     folding_of,
     make_policy,
-    raising_feet,
     reading_contacts,
+    swinging_higher,
     with_parameters,
     without_terms,
 )
@@ -150,8 +150,6 @@ class Trainer:
     def _enter(self, number: int, start: Policy) -> pgpe.State:
         course = self._courses[number]
         read = reading_contacts(start, course.plan.rest, course.plan.contact_scale)
-        if course.plan.swing_lift:
-            read = raising_feet(read, course.plan.swing_lift)
         return pgpe.start(course.folding.fold(read.parameters), course.plan.stdev)
 
     def _course(self, stage: StagePlan, template: Policy) -> _Course:
@@ -163,7 +161,7 @@ class Trainer:
             stdev_learning_rate=stage.stdev_learning_rate,
             weight_decay=stage.weight_decay,
         )
-        template = reading_contacts(template, stage.rest, stage.contact_scale)
+        template = swinging_higher(reading_contacts(template, stage.rest, stage.contact_scale), stage.swing_lift)
         return _Course(stage, template, folding_of(template, stage.symmetry), params)
 
     def _policy_file(self, checkpoint: Checkpoint) -> bytes:

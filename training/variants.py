@@ -144,24 +144,9 @@ def reading_contacts(policy: Policy, all_down: bool, scale: float = CONTACT_SCAL
     return msgspec.structs.replace(read, **{"matrix" if policy.matrix else "hidden": _rows(layer)})
 
 
-def raising_feet(policy: Policy, lift: float) -> Policy:
-    """The same linear policy, but in a trot feet in the air aim higher by ``lift`` m, those on the ground lower.
-
-    Each foot's z shift reads the other diagonal's contacts less its own, so with four feet down nothing changes.
-
-    Raises:
-        PolicyError: the policy has a hidden layer.
-    """
-    if not policy.matrix:
-        raise PolicyError(f"{policy.name}: only a linear policy's feet can be raised by its numbers")
-    rows = np.array(policy.matrix)
-    for foot, diagonal in enumerate((0, 1, 1, 0)):
-        row = policy.action_names.index(SHIFT_NAMES[3 * foot + 2])
-        for other, its in enumerate((0, 1, 1, 0)):
-            column = 10 + other
-            side = 0.5 if its != diagonal else -0.5
-            rows[row, column] += side * lift / policy.observation_scale[column] / policy.action_scale[row]
-    return msgspec.structs.replace(policy, matrix=_rows(rows))
+def swinging_higher(policy: Policy, lift: float) -> Policy:
+    """The same policy with feet that swing higher than the gait says by ``lift`` m."""
+    return msgspec.structs.replace(policy, terms=msgspec.structs.replace(policy.terms, swing_lift=lift))
 
 
 def folding_of(policy: Policy, symmetry: str) -> Folding:

@@ -47,6 +47,8 @@ class Terms(Record, frozen=True, kw_only=True):
     """Share of the ground's estimated slope that the foot targets follow."""
     slope_body: NonNegative = 0.0
     """Share of it that the wanted roll and pitch follow (relative reading)."""
+    swing_lift: Annotated[float, Meta(ge=0.0, le=0.15)] = 0.0
+    """m by which feet swing higher than the gait says: a policy for uneven ground must clear it."""
 
 
 class Policy(Record, frozen=True, kw_only=True):

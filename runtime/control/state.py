@@ -179,6 +179,7 @@ POLICY_DTYPE = np.dtype(
         ("centripetal", "f8"),
         ("slope_feet", "f8"),
         ("slope_body", "f8"),
+        ("swing_lift", "f8"),
         ("matrix", "f8", (28, 24)),  # transposed: the processor takes several actions at a time
         ("hidden", "f8", (HIDDEN, 28)),
         ("readout", "f8", (24, HIDDEN)),

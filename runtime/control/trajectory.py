@@ -32,7 +32,7 @@ def aim_feet(p, g, policy, s, t):  # type: ignore[no-untyped-def]
             share = p.dt / left
             target[0] += (t.touchdown[leg, 0] - target[0]) * share
             target[1] += (t.touchdown[leg, 1] - target[1]) * share
-            target[2] = ground + p.swing_height * math.sin(t.phase[leg])
+            target[2] = ground + (p.swing_height + policy.swing_lift) * math.sin(t.phase[leg])
         else:
             vx = t.velocity_command[0] - t.velocity_command[2] * target[1]
             vy = t.velocity_command[1] + t.velocity_command[2] * target[0]
