@@ -203,7 +203,7 @@ def test_sitting_down_in_the_shadow_ends_the_audition(tmp_path: Path) -> None:
     assert not trial.verdicts[0].accepted and trial.audition.stage is None
 
 
-@pytest.mark.parametrize("name", ["balance", "trot"])
+@pytest.mark.parametrize("name", ["balance", "trot", "trot-rough"])
 def test_shipped_policies_fulfil_the_manifest_and_huge_ones_do_not(name: str) -> None:
     policy = policies.load(policies.find_policy(name), "stoch3")
     check_manifest(policy, 200.0, 10.0, "x")
