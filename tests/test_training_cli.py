@@ -55,6 +55,9 @@ def test_a_finished_run_resumes_to_the_same_policy(finished: Path) -> None:
         (["--robot", "no-such-robot"], "no-such-robot"),
         (["--start", "no-such-policy"], "no-such-policy"),
         (["--reference", "/nonexistent/d.npz"], "No such file"),
+        (["--start", "trot", "--variant", "mlp"], "'trot' is no mlp"),
+        (["--start", "trot", "--variant", "linear-grf"], "no linear-grf"),
+        (["--rough"], "--start"),
     ],
 )
 def test_bad_input_is_one_line_and_a_code(arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -63,6 +66,7 @@ def test_bad_input_is_one_line_and_a_code(arguments: list[str], message: str, tm
     assert code in (1, 2)
     assert output.count("trotd: ") == 1
     assert any(part in output for part in message.split("|"))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_that_holds_a_run_is_left_alone(finished: Path) -> None:

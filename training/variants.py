@@ -112,6 +112,20 @@ def make_policy(
     )
 
 
+def check_variant(policy: Policy, name: str) -> None:
+    """Let a policy through whose numbers a run of this variant can begin with.
+
+    Raises:
+        PolicyError: it has another shape.
+    """
+    wanted, found = VARIANTS[name], Variant(policy.output, len(policy.hidden), policy.reading)
+    if found != wanted:
+        raise PolicyError(
+            f"policy {policy.name!r} is no {name}: it has output {found.output}, {found.hidden} hidden neurons and "
+            f"reading {found.reading}, where {wanted.output}, {wanted.hidden} and {wanted.reading} are wanted"
+        )
+
+
 def with_parameters(policy: Policy, parameters: Array) -> Policy:
     """The same shape with other numbers. ``parameters`` as ``Policy.parameters`` gives them."""
     if policy.matrix:

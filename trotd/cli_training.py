@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trotd.cli_station import ENDPOINT
-from trotd.exits import INTERRUPTED, one_line_errors
+from trotd.exits import INTERRUPTED, UsageError, one_line_errors
 
 if TYPE_CHECKING:
     from runtime.config import Config
@@ -69,6 +69,8 @@ def train(
         from training.checkpoint import RunFolder
         from training.provenance import config_hash, versions
 
+        if rough and not start and resume is None:
+            raise UsageError("--rough goes on from a policy that walks: say which with --start")
         config, beside = _load(robot)
         folder = RunFolder(resume or out or Path("runs") / f"{name}-{seed}")
         with _pushed(config.robot.name, connect, folder) if push else contextlib.nullcontext(_keep) as send:
@@ -82,8 +84,11 @@ def train(
                     without or (),
                 )  # fmt: skip
                 plan = plan.shortened(iterations, directions, ticks)
+            first = _first(config, beside, plan)
+            episode = _reference(config, plan, reference)
+            if resume is None:
                 folder.begin(plan, versions())
-            trainer = _trainer(config, beside, plan, folder, _reference(config, plan, reference), workers, ray)
+            trainer = _trainer(config, plan, folder, first, episode, workers, ray)
             checkpoint = folder.load() if resume is not None and folder.iterations() else trainer.start()
             end = _run(trainer, plan, checkpoint, send)
         _finish(config, folder, trainer, end, workers, validate)
@@ -107,18 +112,26 @@ def _reference(config: Config, plan: RunPlan, saved: Path | None) -> Reference |
     return walked_by(plan.reference, config)
 
 
+def _first(config: Config, beside: Path, plan: RunPlan) -> Policy | None:
+    """Whose numbers the run begins with."""
+    from runtime import policies
+    from training.variants import check_variant
+
+    if not plan.start:
+        return None
+    first = policies.load(policies.find_policy(plan.start, beside), config.robot.name)
+    check_variant(first, plan.variant)
+    return first
+
+
 def _trainer(
-    config: Config, beside: Path, plan: RunPlan, folder: RunFolder, reference: Reference | None, workers: int,
+    config: Config, plan: RunPlan, folder: RunFolder, first: Policy | None, reference: Reference | None, workers: int,
     ray: str | None,
 ) -> Trainer:  # fmt: skip
-    from runtime import policies
     from training.evaluators import make_evaluator
     from training.reference import save_reference
     from training.trainer import Trainer
 
-    first = None
-    if plan.start:
-        first = policies.load(policies.find_policy(plan.start, beside), config.robot.name)
     if reference is not None:
         save_reference(reference, folder.path / "reference.npz")
     return Trainer(config, plan, folder, lambda setup: make_evaluator(setup, workers or None, ray), reference, first)
