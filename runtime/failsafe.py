@@ -99,6 +99,13 @@ TABLE: tuple[Fault, ...] = (
     ),
     Fault("a joint is too fast", Reason.JOINT_SPEED, "limits.judge_joint", "1", INJECTED),
     Fault(
+        "a walking robot's joint is too fast",
+        Reason.JOINT_SPEED,
+        "limits.judge_joint",
+        "`overspeed_time`; beyond `max_overspeed` 1",
+        f"{LIMITS}::test_a_walking_joint_may_be_too_fast_for_a_moment",
+    ),
+    Fault(
         "a reading is not a number",
         Reason.NOT_FINITE,
         "limits.judge_joint",

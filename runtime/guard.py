@@ -226,6 +226,7 @@ class Guard:
         b["noise_share"], b["torque_share"] = _share(period, NOISE_TIME), limits.min_torque_share
         b["torque_follow"], b["rest_follow"] = _share(period, limits.torque_share_time), _share(period, REST_TIME)
         b["tracking_error"], b["tracking_time"] = limits.max_tracking_error, limits.tracking_time
+        b["overspeed"], b["overspeed_time"] = limits.max_overspeed, limits.overspeed_time - 0.5 * period
         b["stuck_time"], b["stuck_motion"] = limits.stuck_time - 0.5 * period, limits.stuck_motion
         b["stuck_tilt"], b["stuck_told"] = limits.stuck_tilt, limits.stuck_told
         b["roughness"], b["overreach"] = limits.max_roughness, limits.max_overreach

@@ -66,11 +66,22 @@ def judge_joint(t, b, m, leg, joint):  # type: ignore[no-untyped-def]
         find(m, b, _STALE_MOTOR, where, age, b.age)
     if age > b.period:
         m.marks |= _COASTED
-    if abs(velocity) > b.joint_velocity[joint]:
-        find(m, b, _JOINT_SPEED, where, velocity, b.joint_velocity[joint])
+    _judge_speed(t, b, m, leg, joint, velocity)
     if temperature > b.temperature:
         find(m, b, _HOT, where, temperature, b.temperature)
     return True
+
+
+@compiled
+def _judge_speed(t, b, m, leg, joint, velocity):  # type: ignore[no-untyped-def]
+    """A joint beyond its speed: at once, but in a walk only for longer than a foot takes that slips off an edge."""
+    bound = b.joint_velocity[joint]
+    if abs(velocity) <= bound:
+        m.too_fast[leg, joint] = 0.0
+        return
+    m.too_fast[leg, joint] += b.period
+    if t.mode != _WALK or m.too_fast[leg, joint] > b.overspeed_time or abs(velocity) > b.overspeed * bound:
+        find(m, b, _JOINT_SPEED, 3 * leg + joint, velocity, bound)
 
 
 @compiled

@@ -79,6 +79,11 @@ class LimitsConfig(Record, frozen=True, kw_only=True):
     """Between a joint and its target, rad."""
     tracking_time: Positive = 0.15
     """For so long, s."""
+    max_overspeed: Annotated[float, Meta(ge=1)] = 2.0
+    """A walking robot's joint may for a moment be so many times as fast as its ``max_velocity``: a foot that slips off
+    an edge spins its knee until it is unloaded ..."""
+    overspeed_time: Positive = 0.025
+    """... but not for so long, s."""
     min_torque_share: Annotated[float, Meta(gt=0, lt=1)] = 0.25
     """A motor that gives less of its commanded torque, on the mean, has lost it; one that gives so much of the
     opposite turns the wrong way."""

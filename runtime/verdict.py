@@ -39,6 +39,8 @@ BOUNDS_DTYPE = np.dtype(
         ("rest_follow", "f8"),
         ("tracking_error", "f8"),
         ("tracking_time", "f8"),
+        ("overspeed", "f8"),  # share of the largest speed
+        ("overspeed_time", "f8"),
         ("thermal_share", "f8"),  # of one tick in the filter of the squared torque
         ("thermal_start", "f8"),
         ("thermal_floor", "f8"),
@@ -99,6 +101,7 @@ MEMORY_DTYPE = np.dtype(
         ("noise", "f8", (4, 3)),  # low-passed unexplained way, rad
         ("rough", "f8", (4, 3)),  # low-passed way that differs from the mean of two speeds, rad
         ("torque_share", "f8", (4, 3)),  # low-passed measured torque over the commanded one
+        ("too_fast", "f8", (4, 3)),  # s for which a joint has been beyond its speed
         ("astray", "f8", (4, 3)),  # s for which a joint has been far from its target
         ("still", "f8", (4, 3)),  # s since the reading last changed, negative before the first
         ("lowest", "f8", (4, 3)),  # torque since then, N·m

@@ -81,6 +81,24 @@ def test_an_injected_fault_is_named(inject: Callable[[Records], None], reason: R
     assert words in guard.explain(reason)
 
 
+def test_a_walking_joint_may_be_too_fast_for_a_moment() -> None:
+    """A foot that slips off an edge spins its knee until it is unloaded, two or three ticks later."""
+    guard, tick = make_guard(overspeed_time=0.025, max_overspeed=2.0), healthy()
+    tick["mode"] = Mode.WALK
+    for speed in (35.0, -40.0, 59.0, 31.0, 29.0, 35.0, 35.0, 35.0, 35.0):
+        tick["joint_velocity"][0, 3, 2] = speed
+        assert guard.judge(tick) is Reason.OK
+    assert guard.judge(tick) is Reason.JOINT_SPEED
+    assert "BR knee: a joint is too fast (35.0 rad/s, bound 30" in guard.explain(Reason.JOINT_SPEED)
+
+
+def test_a_walking_joint_that_is_far_too_fast_is_found_at_once() -> None:
+    guard, tick = make_guard(overspeed_time=0.025, max_overspeed=2.0), healthy()
+    tick["mode"] = Mode.WALK
+    tick["joint_velocity"][0, 3, 2] = -60.5
+    assert guard.judge(tick) is Reason.JOINT_SPEED
+
+
 MEASURED = [
     "orientation",
     "angular_velocity",

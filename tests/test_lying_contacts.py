@@ -98,9 +98,7 @@ def test_nobody_is_suspected_of_a_walk_with_pushes(walk: Walk, push: float) -> N
     assert walk.cycle.clamps[list(Clamp).index(Clamp.CONTACT)] == 0
 
 
-# With seed 0 a loaded foot slips off an edge: 33 N·m spin the bare knee to 30 rad/s in the two ticks until it is unloaded,
-# and the guard of the joint's speed ends the walk first.
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", range(5))  # with 0 a slipping foot spins its knee beyond 30 rad/s
 def test_nobody_is_suspected_of_starts_and_stops_on_rough_ground(only: Walk, seed: int) -> None:
     """Stiff legs share the load as the ground lies, and feet slip off its edges."""
     set_down(only, Scenario(seed=seed, noise=REAL_NOISE, terrain=HeightField(0.03, seed=seed), friction=0.7))

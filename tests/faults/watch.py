@@ -56,6 +56,7 @@ class Outcome(msgspec.Struct, kw_only=True):
 def broken(measurement: Measurement, config: Config) -> str:
     """What in a measurement is past a bound of the configuration; empty for nothing. Says it without the guard."""
     limits, joints, imu = config.limits, measurement.joints, measurement.imu
+    fastest = np.array(config.robot.joints.max_velocity)
     numbers = [joints.position, joints.velocity, joints.torque, joints.temperature, joints.age]
     numbers += [imu.orientation, imu.angular_velocity, imu.linear_acceleration, np.array([measurement.voltage])]
     if not all(np.isfinite(part).all() for part in numbers):
@@ -69,7 +70,7 @@ def broken(measurement: Measurement, config: Config) -> str:
         ("turn rate", np.abs(imu.angular_velocity).max() > limits.max_angular_velocity),
         ("acceleration", np.abs(imu.linear_acceleration).max() > limits.max_acceleration),
         ("tilt", 1.0 - 2.0 * (x * x + y * y) < math.cos(limits.max_tilt) - 1e-9),
-        ("joint speed", (np.abs(joints.velocity) > np.array(config.robot.joints.max_velocity)).any()),
+        ("joint speed", (np.abs(joints.velocity) > limits.max_overspeed * fastest).any()),
         ("temperature", joints.temperature.max() > limits.max_temperature),
         ("voltage", measurement.voltage < limits.min_voltage),
     ):
