@@ -97,6 +97,18 @@ def test_a_hostile_candidate_in_the_walk_is_given_up_before_the_robot_falls(tmp_
     assert trial.audition.stage is None and not hasattr(trial.shelf, "kept")
 
 
+@pytest.mark.parametrize("walking", [True, False])
+def test_the_policy_for_uneven_ground_takes_over_from_the_default(tmp_path: Path, walking: bool) -> None:
+    rough = load(find_policy("trot-rough"), "stoch3")
+    trial = Trial(tmp_path, walking)
+    trial.offer(PolicyFile(rough, encode_policy(rough)))
+    trial.run(4.0)
+    assert trial.verdicts[0].accepted, trial.verdicts[0].words
+    trial.set_off()
+    trial.run(4.0)
+    assert trial.walk.cycle.policy == rough and trial.stands_firm(), trial.tilt
+
+
 def test_what_asks_for_the_opposite_does_not_pass_the_shadow(tmp_path: Path) -> None:
     trial = Trial(tmp_path, True)
     trial.offer(candidate("flipped", HOSTILE["flipped"]))

@@ -88,9 +88,16 @@ TASK = Randomization(
 """The second stage, from the method's page."""
 WIDE = replace(TASK, push_impulse=(10.0, 50.0), standing_share=0.12, weak_share=0.25, motor_strength=(0.42, 1.0))
 """The task, standing, and motors that give less than they should."""
-WEAK = replace(TASK, friction=(0.5, 1.2), standing_share=0.06, weak_share=0.12, motor_strength=(0.42, 0.6))
+WEAK = replace(
+    TASK,
+    friction=(0.5, 1.2),
+    push_impulse=(10.0, 57.0),
+    standing_share=0.06,
+    weak_share=0.2,
+    motor_strength=(0.42, 0.6),
+)
 """The task, standing, and motors at half their strength: what a hard torque clip leaves."""
-HARD = replace(WEAK, friction=(0.3, 1.2), weak_share=0.25)
+HARD = replace(WEAK, friction=(0.3, 1.2), weak_share=0.3)
 """More of that, and ground as smooth as the table's smoothest."""
 ROUGH = Randomization(
     tilt=0.2, friction=(0.6, 1.2), noise=True, push_probability=0.4, push_impulse=(10.0, 35.0), push_time=(0.6, 2.5),
