@@ -99,9 +99,9 @@ SETTLE = msgspec.structs.replace(
 )  # fmt: skip
 """From numbers that walk: what stands asks for nothing, and motors may be weak. Small steps keep what was polished."""
 HARDEN = msgspec.structs.replace(
-    SETTLE, name="harden", iterations=40, conditions="hard", learning_rate=0.005, learning_rate_end=0.0005,
+    SETTLE, name="harden", iterations=40, conditions="hard", learning_rate=0.008, learning_rate_end=0.0008,
 )  # fmt: skip
-"""What little friction and a hard torque clip still take down."""
+"""What little friction, a hard torque clip and hard pushes still take down."""
 ROUGHEN = msgspec.structs.replace(
     POLISH, name="roughen", iterations=60, directions=48, ticks=800, conditions="rough", learning_rate=0.015,
     learning_rate_end=0.0015, rest=True, contact_scale=0.2, swing_lift=0.05,

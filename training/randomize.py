@@ -97,8 +97,8 @@ WEAK = replace(
     motor_strength=(0.42, 0.6),
 )
 """The task, standing, and motors at half their strength: what a hard torque clip leaves."""
-HARD = replace(WEAK, friction=(0.3, 1.2), weak_share=0.3)
-"""More of that, and ground as smooth as the table's smoothest."""
+HARD = replace(WEAK, friction=(0.3, 1.2), push_impulse=(20.0, 65.0), weak_share=0.3)
+"""More of that, pushes that few withstand, and ground as smooth as the table's smoothest."""
 ROUGH = Randomization(
     tilt=0.2, friction=(0.6, 1.2), noise=True, push_probability=0.4, push_impulse=(10.0, 35.0), push_time=(0.6, 2.5),
     bump=0.1, bump_spacing=(0.1, 0.2), slope=0.2, level_share=0.15,
