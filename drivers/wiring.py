@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from drivers.description import PerLeg, Positive, Positive3, Record
+from drivers.description import PerLeg, Positive, Record
 
 Id = Annotated[int, Meta(ge=1, le=126)]
 BusNumber = Annotated[int, Meta(ge=1, le=16)]
@@ -24,6 +24,8 @@ PerLegDirections = tuple[
     tuple[Direction, Direction, Direction],
     tuple[Direction, Direction, Direction],
 ]
+Gear = Annotated[float, Meta(ge=0.01, le=1e4)]
+MotorTorque = Annotated[float, Meta(gt=0, le=1e6)]
 Format = Literal["float", "compact"]
 Baud = Literal[115200, 230400, 460800, 921600, 2000000, 3500000, 4000000]
 Quaternion = tuple[float, float, float, float]
@@ -56,9 +58,9 @@ class MotorsConfig(Record, frozen=True, kw_only=True):
     """+1 where the motor turns as the joint does."""
     offset: PerLeg
     """rad: joint = direction · motor / gear − offset."""
-    gear: Positive3 = (1.0, 1.0, 1.0)
+    gear: tuple[Gear, Gear, Gear] = (1.0, 1.0, 1.0)
     """Turns that the motor reports in one turn of the joint, for abduction, hip, knee."""
-    max_torque: Positive3
+    max_torque: tuple[MotorTorque, MotorTorque, MotorTorque]
     """Bound sent with every command, N·m at the joint."""
     watchdog: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.1
     """s without a command after which a motor goes limp by itself."""

@@ -98,11 +98,11 @@ def parse(table: dict[str, Any], place: str) -> Config:
     """Check a TOML table; ``place`` is how messages name where it came from."""
     for key, value in _numbers(table, ""):
         if not math.isfinite(value):
-            raise ConfigError(f"{place}: {key} = {value}: must be finite")
+            raise ConfigError(f"{place}: {_one_line(key)} = {value}: must be finite")
     try:
         config = msgspec.convert(table, Config)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{place}: {_explain(str(error), table)}") from error
+        raise ConfigError(f"{place}: {_one_line(_explain(str(error), table))}") from error
     for problem in _contradictions(config):
         raise ConfigError(f"{place}: {problem}")
     return config
@@ -204,6 +204,11 @@ def _numbers(value: Any, key: str) -> Iterator[tuple[str, float]]:
             yield from _numbers(item, f"{key}[{index}]")
     elif isinstance(value, float):
         yield key, value
+
+
+def _one_line(words: str) -> str:
+    """The same with what would break the line escaped: a key may be any text."""
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in words)
 
 
 def _explain(message: str, table: dict[str, Any]) -> str:

@@ -63,6 +63,22 @@ def test_whatever_stands_in_the_file_loads_or_is_one_line(path: tuple[Any, ...],
         assert isinstance(made, Config)
 
 
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("robot",), {"\n": 0}, r"unknown field `\n`"),
+        (("robot",), {"a\r": math.nan}, r"robot.a\r = nan"),
+        (("motors", "gear", 0), 3e-183, "motors.gear[0] = 3e-183"),
+        (("motors", "gear", 0), 1.4e154, "motors.gear[0] = 1.4e+154"),
+        (("motors", "max_torque", 2), 1e200, "motors.max_torque[2] = 1e+200"),
+    ],
+)
+def test_odd_keys_and_numbers_are_named_on_one_line(path: tuple[Any, ...], value: Any, words: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        config.parse(changed(path, value), "my.toml")
+    assert words in str(refused.value) and str(refused.value).isprintable()
+
+
 @settings(max_examples=200, deadline=None)
 @given(st.text(max_size=200) | st.binary(max_size=200))
 def test_whatever_the_file_is_it_loads_or_is_one_line(
