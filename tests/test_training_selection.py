@@ -17,6 +17,9 @@ from training import pgpe, selection
 from training.checkpoint import Checkpoint, Row, RunFolder
 from training.contest import Contender, Outcome, Trial
 from training.plan import IMITATE, ROUGHEN, SETTLE, StagePlan
+from training.randomize import TASK
+from training.table import QUICK, make_tests
+from training.validation import validation_set
 from training.variants import VARIANTS, make_policy, with_parameters
 
 CONFIG = configuration.load(configuration.find_robot("stoch3"))
@@ -40,6 +43,19 @@ class NearnessContest:
         assert who.path is not None
         far = float(np.linalg.norm(policies.load(Path(who.path), "stoch3").parameters - BEST))
         return [Outcome(False, 2.6, (0.0, 0.0, 0.0), 0.5, 9.0, 4.0, task_return=-far, compute=1e-4) for _ in trials]
+
+
+class WatchedTable(NearnessContest):
+    """Takes down the seeds of what it is asked to play."""
+
+    walking_height = 0.3
+
+    def __init__(self) -> None:
+        self.seeds: set[int] = set()
+
+    def play(self, who: Contender, trials: Sequence[Trial]) -> list[Outcome]:
+        self.seeds |= {trial.conditions.scenario.seed for trial in trials}
+        return [Outcome(False, 2.6, (0.0, 0.0, 0.0), 0.5, 9.0, 4.0, task_return=0.0, compute=1e-4) for _ in trials]
 
 
 def run_of(path: Path, means: Sequence[Array]) -> RunFolder:
@@ -72,7 +88,7 @@ def test_means_that_wander_around_the_best_numbers_are_averaged(tmp_path: Path) 
     assert parameters == pytest.approx(np.mean(tail, axis=0), abs=1e-12)
     verdicts = provenance["validation"]
     assert isinstance(verdicts, list)
-    assert [verdict["averaged"] for verdict in verdicts] == [1, 1, 1, 1, 6]
+    assert [verdict["averaged"] for verdict in verdicts] == [1, 1, 1, 1, 1, 1, 6]
 
 
 def test_one_checkpoint_that_is_better_than_the_mean_is_kept(tmp_path: Path) -> None:
@@ -103,3 +119,27 @@ def test_the_ground_that_was_trained_on_judges(
     monkeypatch.setattr(selection, "Contest", WatchedContest)
     selected(run_of(tmp_path, [BEST]), stage)
     assert {type(trial.conditions.scenario.terrain) for trial in played} == grounds
+
+
+def test_what_judges_is_asked_for_as_hard_as_the_table_asks() -> None:
+    """A forward push of 55 N·s in every phase and both ways, one sideways above 45, and torques clipped at 18 N·m."""
+    hard = [trial.conditions.scenario for trial in validation_set(TASK).hard]
+    impulses = [0.1 * np.array(push.force) for scenario in hard for push in scenario.pushes]
+    forward = [impulse[0] for impulse in impulses if abs(impulse[1]) < 1e-9]
+    sideways = [impulse[1] for impulse in impulses if abs(impulse[0]) < 1e-9]
+    assert sorted(set(np.round(forward, 6))) == [-55.0, 55.0] and len(forward) == 16
+    assert min(np.abs(sideways)) > 45.0 and len(sideways) == 16
+    starts = {round(push.start % 0.4, 6) for scenario in hard for push in scenario.pushes}
+    assert len(starts) == 8
+    assert {scenario.motor_strength * CONFIG.robot.joints.peak_torque[0] for scenario in hard} == {40.0, 18.0}
+
+
+def test_no_walk_that_judges_is_one_of_the_table() -> None:
+    """A policy chosen by the walks that then praise it would be praised too much."""
+    judged = validation_set(TASK)
+    seeds = {trial.conditions.scenario.seed for trial in judged.measured + judged.hard + judged.drawn}
+    table = WatchedTable()
+    for test in make_tests(QUICK).values():
+        test(table, Contender("anyone", "zero"))  # type: ignore[arg-type]
+    assert len(table.seeds) > QUICK.draws
+    assert not seeds & table.seeds

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import pi
 
 import msgspec
 import numpy as np
@@ -12,21 +11,15 @@ import numpy as np
 from runtime import policies
 from runtime.config import Config
 from runtime.control.policy import Policy, encode_policy
-from sim.scenario import Push, Scenario
 from training.checkpoint import RunFolder, write_whole
-from training.contest import Contender, Contest, Outcome, Trial
+from training.contest import Contender, Contest
 from training.plan import StagePlan
-from training.randomize import SENSORS, SETS, TASK, Conditions, Randomization, draw
+from training.randomize import SETS, TASK, Randomization
+from training.validation import validation_set
 from training.variants import with_parameters
 
-CANDIDATES = 4
-"""Checkpoints that are compared: the last ones, evenly spread over the last stage."""
-DRAWS = 24
-"""Episodes drawn at random, beside the measured walks and the pushes."""
-STANDING_TIME = 20.0
-"""s: what leans a little more every second has fallen by then."""
-VALIDATION_SEED = 5_000
-"""Of the episodes that judge; apart from training's and from the table's."""
+CANDIDATES = 6
+"""Checkpoints that are compared: of the last stage, evenly spread over its last two thirds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,64 +30,41 @@ class Verdict:
     averaged: int
     """Checkpoints up to this one that its numbers are the mean of; 1: it is that checkpoint."""
     falls: int
+    """On all of the set."""
     error: float
-    """Mean velocity error over the grid, m/s."""
+    """Mean velocity error of the measured walks, m/s."""
     task_return: float
+    """Mean of the drawn walks, each with what its fall cost it."""
 
     @property
     def score(self) -> float:
-        """Return less 50 a fall and 10 a cm/s of error: what the table asks for, in one number."""
-        return self.task_return - 50.0 * self.falls - 1000.0 * self.error
-
-
-def validation_set(bounds: Randomization = TASK) -> tuple[list[Trial], list[Trial]]:
-    """Velocities that are measured on level ground, and pushes, spawns and draws that are to be survived."""
-    commands = ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (-0.4, 0.0, 0.0), (1.6, 0.0, 0.0), (0.0, 0.3, 0.0), (0.5, 0.0, 0.5))
-    measured = [Trial(Conditions(Scenario(seed=VALIDATION_SEED, noise=SENSORS), command), 5.0) for command in commands]
-    pushed = [
-        Trial(
-            Conditions(
-                Scenario(
-                    seed=VALIDATION_SEED + phase,
-                    noise=SENSORS,
-                    pushes=(Push(1.6 + 0.1 * phase, 0.1, (450.0 * np.cos(side), 450.0 * np.sin(side), 0.0)),),
-                ),
-                (0.4, 0.0, 0.0),
-            ),
-            3.5,
-        )
-        for phase in range(4)
-        for side in (0.0, pi / 2, pi, -pi / 2)
-    ]
-    standing = Conditions(Scenario(seed=VALIDATION_SEED, noise=SENSORS), (0.0, 0.0, 0.0), standing=True)
-    measured.append(Trial(standing, STANDING_TIME))
-    rng = np.random.default_rng(VALIDATION_SEED)
-    return measured, pushed + [Trial(draw(bounds, rng), 2.6) for _ in range(DRAWS)]
+        """Return less 10 a fall and 10 a cm/s of error: what the table asks for, in one number."""
+        return self.task_return - 10.0 * self.falls - 1000.0 * self.error
 
 
 def judge(contest: Contest, who: Contender, iteration: int, averaged: int = 1, bounds: Randomization = TASK) -> Verdict:
     """One candidate; ``bounds`` of the draws."""
-    measured, survived = validation_set(bounds)
-    walks = contest.play(who, measured)
-    rest: list[Outcome] = contest.play(who, survived)
-    wanted = np.array([trial.conditions.command for trial in measured])
-    errors = np.abs(np.array([outcome.velocity for outcome in walks]) - wanted)[:, :2]
+    walks = validation_set(bounds)
+    measured, hard, drawn = (contest.play(who, trials) for trials in (walks.measured, walks.hard, walks.drawn))
+    wanted = np.array([trial.conditions.command for trial in walks.measured])
+    errors = np.abs(np.array([outcome.velocity for outcome in measured]) - wanted)[:, :2]
     return Verdict(
         iteration=iteration,
         averaged=averaged,
-        falls=sum(outcome.fell for outcome in [*walks, *rest]),
+        falls=sum(outcome.fell for outcome in [*measured, *hard, *drawn]),
         error=float(errors.mean()),
-        task_return=float(np.mean([outcome.task_return for outcome in rest])),
+        task_return=float(np.mean([outcome.task_return for outcome in drawn])),
     )
 
 
 def select(config: Config, folder: RunFolder, stage: StagePlan, workers: int, say: Callable[[str], None]) -> Policy:
     """The best of the last stage's checkpoints and their mean, with the verdicts in its provenance.
 
-    ``stage``, the last, tells what draws judge: its own where it serves a task, so that uneven ground judges what was
-    trained on it.
+    ``stage``, the last, tells what ground judges: uneven ground what was trained on it, else the level task, whatever
+    harder draws it was trained with.
     """
-    bounds = SETS[stage.conditions] if stage.reward == "task" else TASK
+    trained = SETS[stage.conditions]
+    bounds = trained if trained.bump else TASK
     numbers = folder.iterations()
     last_stage = [row.iteration for row in folder.curve() if row.stage == folder.curve()[-1].stage]
     last = [number for number in numbers if number in last_stage] or numbers

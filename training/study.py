@@ -23,8 +23,8 @@ from training.randomize import IMITATION, SENSORS, Conditions, draw
 from training.reference import Reference
 from training.reward import TableReward
 from training.rollout import Setup, Stage, Task
-from training.selection import VALIDATION_SEED
 from training.trainer import MakeEvaluator, Report, Trainer
+from training.validation import VALIDATION_SEED
 from training.variants import Variant, make_policy
 
 DRAWS = 16

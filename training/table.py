@@ -26,6 +26,10 @@ ADULT_SEED = 10_000
 """Test seeds start here: no training iteration draws from them."""
 CYCLE = 0.4
 """s; pushes come at eight phases of it."""
+CLIPPED = 18.0 / 40.0
+"""Strength of motors whose torque is clipped at 18 of their 40 N·m."""
+HARD_COMMANDS: tuple[Command, ...] = ((0.5, 0.0, 0.0), (0.0, 0.2, 0.0), (0.3, 0.0, 0.4), (0.0, 0.0, 0.0))
+"""Of walks with less than the robot should have, in turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +60,7 @@ def make_tests(size: Size) -> dict[str, Test]:
         "push forward": lambda contest, who: _push(contest, who, size, 0.0),
         "start ±20° pitch, ±15° roll": lambda contest, who: _survive(contest, who, _tilted(size)),
         "start at U[0, π/6]": lambda contest, who: _survive(contest, who, _thrown(size)),
-        "18 N·m": lambda contest, who: _hard(contest, who, size, motor_strength=18.0 / 40.0),
+        "18 N·m": lambda contest, who: _hard(contest, who, size, motor_strength=CLIPPED),
         "10 ms later": lambda contest, who: _hard(contest, who, size, extra_delay=0.010),
         "+5 kg": lambda contest, who: _hard(contest, who, size, payload=5.0),
         "friction 0.3": lambda contest, who: _hard(contest, who, size, friction=0.3),
@@ -129,9 +133,9 @@ def _survive(contest: Contest, who: Contender, trials: list[Trial]) -> Cells:
 
 
 def _hard(contest: Contest, who: Contender, size: Size, **changes: object) -> Cells:
-    commands: tuple[Command, ...] = ((0.5, 0.0, 0.0), (0.0, 0.2, 0.0), (0.3, 0.0, 0.4), (0.0, 0.0, 0.0))
     trials = [
-        Trial(Conditions(_noisy(seed, **changes), commands[seed % len(commands)]), 5.0) for seed in range(size.seeds)
+        Trial(Conditions(_noisy(seed, **changes), HARD_COMMANDS[seed % len(HARD_COMMANDS)]), 5.0)
+        for seed in range(size.seeds)
     ]
     return _survive(contest, who, trials)
 
