@@ -104,7 +104,7 @@ def parse(table: dict[str, Any], place: str) -> Config:
     except msgspec.ValidationError as error:
         raise ConfigError(f"{place}: {_one_line(_explain(str(error), table))}") from error
     for problem in _contradictions(config):
-        raise ConfigError(f"{place}: {problem}")
+        raise ConfigError(f"{place}: {_one_line(problem)}")
     return config
 
 

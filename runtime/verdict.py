@@ -39,7 +39,7 @@ BOUNDS_DTYPE = np.dtype(
         ("rest_follow", "f8"),
         ("tracking_error", "f8"),
         ("tracking_time", "f8"),
-        ("overspeed", "f8"),  # share of the largest speed
+        ("overspeed", "f8"),  # times the largest speed
         ("overspeed_time", "f8"),
         ("thermal_share", "f8"),  # of one tick in the filter of the squared torque
         ("thermal_start", "f8"),

@@ -10,7 +10,6 @@ from walks import Walk
 
 from drivers.robot import LEGS
 from runtime.control.records import Clamp
-from runtime.cycle import Cycle
 from runtime.messages.mode import Mode, Request
 from runtime.reasons import Reason
 from sim.scenario import Scenario
@@ -25,20 +24,11 @@ def only(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
     walk.world.close()
 
 
-def set_down(walk: Walk, scenario: Scenario | None = None) -> None:
-    """A robot that stands, its memory blank."""
-    walk.measurement = walk.world.reset(scenario or Scenario())
-    walk.recorder.events.clear()
-    walk.cycle = Cycle(walk.config, walk.policy)
-    walk.cycle.warm_up(walk.measurement)
-    walk.command, walk.index = walk.cycle.sources.damp, 0
-    walk.stand()
-
-
 @pytest.fixture
 def walk(only: Walk) -> Walk:
     """A robot that walks at 0.5 m/s."""
-    set_down(only)
+    only.set_down(Scenario())
+    only.stand()
     only.run(0.3)
     only.ask(Request.WALK)
     only.run(1.0, (0.5, 0.0, 0.0))
@@ -101,7 +91,8 @@ def test_nobody_is_suspected_of_a_walk_with_pushes(walk: Walk, push: float) -> N
 @pytest.mark.parametrize("seed", range(5))  # with 0 a slipping foot spins its knee beyond 30 rad/s
 def test_nobody_is_suspected_of_starts_and_stops_on_rough_ground(only: Walk, seed: int) -> None:
     """Stiff legs share the load as the ground lies, and feet slip off its edges."""
-    set_down(only, Scenario(seed=seed, noise=REAL_NOISE, terrain=HeightField(0.03, seed=seed), friction=0.7))
+    only.set_down(Scenario(seed=seed, noise=REAL_NOISE, terrain=HeightField(0.03, seed=seed), friction=0.7))
+    only.stand()
     for _ in range(4):
         only.ask(Request.WALK)
         only.run(1.0, (0.3, 0.1, 0.4))

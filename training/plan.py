@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers.description import Name, NonNegative, Positive, Record
+from runtime.control.policy import SwingLift
 from training.variants import CONTACT_SCALE, Term, find_terms
 
 Count = Annotated[int, Meta(ge=1)]
@@ -32,7 +33,7 @@ class StagePlan(Record, frozen=True, kw_only=True):
     """Contacts are read less four feet on the ground, so that who stands asks for nothing (decision 14)."""
     contact_scale: Positive = CONTACT_SCALE
     """Of the contacts in the observation: ten times as large learns them ten times as fast."""
-    swing_lift: NonNegative = 0.0
+    swing_lift: SwingLift = 0.0
     """m by which feet swing higher than the gait says (``policy.Terms``): falls are too rare a sign to learn it by."""
     stdev: Positive = 0.1
     stdev_learning_rate: NonNegative = 0.1

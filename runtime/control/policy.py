@@ -24,6 +24,8 @@ WRENCH_NAMES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment
 GRF_NAMES = tuple(f"grf_{leg}_{axis}" for leg in LEGS for axis in "xyz")
 _SHIFT, _WRENCH = int(Clamp.SHIFT), int(Clamp.WRENCH)
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
+SwingLift = Annotated[float, Meta(ge=0.0, le=0.15)]
+"""m."""
 
 
 class Terms(Record, frozen=True, kw_only=True):
@@ -47,7 +49,7 @@ class Terms(Record, frozen=True, kw_only=True):
     """Share of the ground's estimated slope that the foot targets follow."""
     slope_body: NonNegative = 0.0
     """Share of it that the wanted roll and pitch follow (relative reading)."""
-    swing_lift: Annotated[float, Meta(ge=0.0, le=0.15)] = 0.0
+    swing_lift: SwingLift = 0.0
     """m by which feet swing higher than the gait says: a policy for uneven ground must clear it."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from runtime.policies import find_policy, load
 from runtime.recorder import Recorder
 from runtime.recording import Header, layout
 from runtime.tick_record import Wake
+
+if TYPE_CHECKING:
+    from sim.scenario import Scenario
 
 LIES_DOWN = 1.2
 """s until a robot that was set down lies still."""
@@ -42,17 +46,22 @@ class Outing:
         self.policy = load(find_policy(self.config.control.policy), self.config.robot.name)
         control = self.config.control
         self.world = World(self.config.robot, control.rate_hz, control.gait.walking_height)
-        self.cycle = Cycle(self.config, self.policy)
         self.recorder = Recorder(folder, control.rate_hz, seconds, 100, 2_000_000_000)
-        self.measurement = self.world.reset(Scenario())
-        self.cycle.warm_up(self.measurement)
-        self.command = damp_command(self.config.damp.kd)
-        self.index = 0
-        """Ticks so far."""
+        self.set_down(Scenario())
         self.after: Callable[[], None] = lambda: None
         """Called after every tick, in the place of the daemon's slack."""
         self.policies: dict[int, str] = {}
         """Those before the active one, by generation."""
+
+    def set_down(self, scenario: Scenario) -> None:
+        """Onto the ground of ``scenario``, damped, with a blank memory."""
+        self.cycle = Cycle(self.config, self.policy)
+        self.measurement = self.world.reset(scenario)
+        self.cycle.warm_up(self.measurement)
+        self.command = damp_command(self.config.damp.kd)
+        self.recorder.events.clear()
+        self.index = 0
+        """Ticks so far."""
 
     def run(self, seconds: float, velocity: tuple[float, float, float] | None = None) -> None:
         """Live on, under one velocity command if any."""
