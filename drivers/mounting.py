@@ -32,11 +32,13 @@ class Mounting:
         self._conjugate: Array = np.array([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
 
     def vector(self, vector: Array) -> Array:
-        """A vector (3,) of the sensor's frame, in the body's."""
-        turned: Array = self.rotation_sensor_to_body @ vector
+        """A vector (3,) of the sensor's frame, in the body's; what is not finite stays so, and the guard says it."""
+        with np.errstate(invalid="ignore"):
+            turned: Array = self.rotation_sensor_to_body @ vector
         return turned
 
     def orientation(self, orientation: Array) -> Array:
-        """Sensor → world (4,) as body → world (4,)."""
-        turned: Array = self._conjugate @ orientation
+        """Sensor → world (4,) as body → world (4,); what is not finite stays so."""
+        with np.errstate(invalid="ignore"):
+            turned: Array = self._conjugate @ orientation
         return turned
