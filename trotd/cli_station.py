@@ -22,7 +22,7 @@ def view(
     recording: Annotated[Path | None, typer.Argument(help="A recording; without one, the live robot.")] = None,
     robot: RobotOption = "stoch3",
     connect: ConnectOption = ENDPOINT,
-    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="To a browser; rerun listens on all interfaces.")] = False,
     web_port: Annotated[int, typer.Option(help="Where the browser finds it.")] = 9090,
     port: Annotated[int, typer.Option(help="Where the viewer takes data.")] = 9876,
     save: Annotated[Path | None, typer.Option("--save", help="Write an .rrd file instead.")] = None,
