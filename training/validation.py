@@ -19,8 +19,8 @@ DRAWS = 96
 """Episodes drawn at random, whose return counts."""
 STANDING_TIME = 20.0
 """s: what leans a little more every second has fallen by then."""
-FORWARD, SIDEWAYS = 55.0, 47.5
-"""N·s of the pushes along and across: what is asked of the shipped policy, and just above it."""
+FORWARD, SIDEWAYS = 60.0, 50.0
+"""N·s of the pushes along and across: 5 more than is asked of the shipped policy, where nearly all stand."""
 PHASES = 8
 
 
