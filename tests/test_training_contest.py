@@ -30,6 +30,7 @@ from training.plan import make_plan
 from training.randomize import SENSORS, Conditions
 from training.robot_reference import record_reference
 from training.rollout import walk
+from training.walks import Walks
 
 SHIPPED = sorted(path.stem for path in POLICIES.glob("*.json") if json.loads(path.read_text())["robot"] == "stoch3")
 CONFIG = configuration.load(configuration.find_robot("stoch3"))
@@ -191,7 +192,7 @@ def test_a_term_that_is_none_or_of_no_policy_is_refused() -> None:
     with pytest.raises(PolicyError, match="mpc is no policy file"):
         ablated(find_contender("mpc"), ["slope"])
     with pytest.raises(PolicyError, match="no fixed term 'speed'"):
-        make_plan("tried", "stoch3", "0" * 16, 1, "linear", "", False, False, without=["speed"])
+        make_plan("tried", "stoch3", "0" * 16, without=["speed"])
 
 
 class Threshold:
@@ -216,7 +217,7 @@ def test_the_push_search_finds_the_largest_that_all_survive(limit: float, found:
 
 
 def test_pushes_come_at_eight_phases_with_both_signs() -> None:
-    trials = table._pushes(table.FULL, np.pi / 2, 40.0)
+    trials = Walks(7).pushed(np.pi / 2, 40.0, phases=8)
     assert len(trials) == 16
     starts = sorted({trial.conditions.scenario.pushes[0].start for trial in trials})
     np.testing.assert_allclose(np.diff(starts), 0.05)

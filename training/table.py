@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import cos, pi, radians, sin
+from math import pi, radians
 
 import numpy as np
 
-from sim.scenario import Noise, Push, Scenario
-from sim.terrain import HeightField, Slope, Steps, Terrain
+from sim.scenario import Noise, Scenario
+from sim.terrain import HeightField, Slope, Steps
 from training.contest import Contender, Contest, Outcome, Trial
 from training.randomize import SENSORS, TASK, Conditions, draw
+from training.walks import CLIPPED, Command, Walks
 
-Command = tuple[float, float, float]
 Cells = dict[str, float]
 """What a test says of a contender: column → number."""
 Test = Callable[[Contest, Contender], Cells]
@@ -24,12 +24,7 @@ GRID: tuple[Command, ...] = (
 )  # fmt: skip
 ADULT_SEED = 10_000
 """Test seeds start here: no training iteration draws from them."""
-CYCLE = 0.4
-"""s; pushes come at eight phases of it."""
-CLIPPED = 18.0 / 40.0
-"""Strength of motors whose torque is clipped at 18 of their 40 N·m."""
-HARD_COMMANDS: tuple[Command, ...] = ((0.5, 0.0, 0.0), (0.0, 0.2, 0.0), (0.3, 0.0, 0.4), (0.0, 0.0, 0.0))
-"""Of walks with less than the robot should have, in turn."""
+WALKS = Walks(ADULT_SEED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +50,7 @@ def make_tests(size: Size) -> dict[str, Test]:
         "velocity, noisy": lambda contest, who: _grid(contest, who, size, SENSORS),
         "velocity, clean": lambda contest, who: _grid(contest, who, size, Noise()),
         "standing": lambda contest, who: _stand(contest, who, size),
-        "forward 2.0 m/s": lambda contest, who: _survive(contest, who, _same(_noisy(0), (2.0, 0.0, 0.0), size.walk)),
+        "forward 2.0 m/s": lambda contest, who: _survive(contest, who, [WALKS.follow((2.0, 0.0, 0.0), size.walk)]),
         "push sideways": lambda contest, who: _push(contest, who, size, pi / 2),
         "push forward": lambda contest, who: _push(contest, who, size, 0.0),
         "start ±20° pitch, ±15° roll": lambda contest, who: _survive(contest, who, _tilted(size)),
@@ -75,11 +70,13 @@ def make_rough_tests(size: Size) -> dict[str, Test]:
     def fields(amplitude: float, spacing: float) -> Test:
         seeds = range(ADULT_SEED, ADULT_SEED + size.seeds)
         grounds = [HeightField(amplitude, spacing, seed, extent=24.0) for seed in seeds]
-        return lambda contest, who: _survive(contest, who, [_on(ground, 20.0) for ground in grounds])
+        return lambda contest, who: _survive(contest, who, [WALKS.cross(ground, 20.0) for ground in grounds])
 
     def slopes(direction: float) -> Test:
         ground = Slope(radians(12.0), direction)
-        return lambda contest, who: _survive(contest, who, [_on(ground, 10.0, seed) for seed in range(size.seeds)])
+        return lambda contest, who: _survive(
+            contest, who, [WALKS.cross(ground, 10.0, seed) for seed in range(size.seeds)]
+        )
 
     return {
         "±5 cm, 0.10 m": fields(0.05, 0.10),
@@ -89,21 +86,9 @@ def make_rough_tests(size: Size) -> dict[str, Test]:
         "12° down": slopes(pi),
         "12° across": slopes(pi / 2),
         "steps of 6 cm": lambda contest, who: _survive(
-            contest, who, [_on(Steps(0.06, depth=0.35, count=3), 12.0, seed) for seed in range(size.seeds)]
+            contest, who, [WALKS.cross(Steps(0.06, depth=0.35, count=3), 12.0, seed) for seed in range(size.seeds)]
         ),
     }
-
-
-def _noisy(seed: int, **changes: object) -> Scenario:
-    return Scenario(seed=ADULT_SEED + seed, noise=SENSORS, **changes)  # type: ignore[arg-type]
-
-
-def _same(scenario: Scenario, command: Command, seconds: float) -> list[Trial]:
-    return [Trial(Conditions(scenario, command), seconds)]
-
-
-def _on(terrain: Terrain, seconds: float, seed: int = 0) -> Trial:
-    return Trial(Conditions(_noisy(seed, terrain=terrain), (0.5, 0.0, 0.0)), seconds)
 
 
 def _grid(contest: Contest, who: Contender, size: Size, noise: Noise) -> Cells:
@@ -121,8 +106,7 @@ def _grid(contest: Contest, who: Contender, size: Size, noise: Noise) -> Cells:
 
 
 def _stand(contest: Contest, who: Contender, size: Size) -> Cells:
-    standing = [Conditions(_noisy(seed), (0.0, 0.0, 0.0), standing=True) for seed in range(size.seeds)]
-    outcomes = contest.play(who, [Trial(conditions, 20.0) for conditions in standing])
+    outcomes = contest.play(who, [WALKS.stand(seed) for seed in range(size.seeds)])
     errors = np.array([outcome.height for outcome in outcomes]) - contest.walking_height
     return {"height error mm": 1e3 * float(np.abs(errors).max()), "falls": float(sum(o.fell for o in outcomes))}
 
@@ -133,11 +117,7 @@ def _survive(contest: Contest, who: Contender, trials: list[Trial]) -> Cells:
 
 
 def _hard(contest: Contest, who: Contender, size: Size, **changes: object) -> Cells:
-    trials = [
-        Trial(Conditions(_noisy(seed, **changes), HARD_COMMANDS[seed % len(HARD_COMMANDS)]), 5.0)
-        for seed in range(size.seeds)
-    ]
-    return _survive(contest, who, trials)
+    return _survive(contest, who, WALKS.hard(size.seeds, **changes))
 
 
 def _tilted(size: Size) -> list[Trial]:
@@ -145,7 +125,7 @@ def _tilted(size: Size) -> list[Trial]:
     corners = [(r * roll, p * pitch, 0.0) for r in (-1, 1) for p in (-1, 1)]
     corners += [(roll, 0.0, 0.0), (-roll, 0.0, 0.0), (0.0, pitch, 0.0), (0.0, -pitch, 0.0)]
     return [
-        Trial(Conditions(_noisy(seed, rpy=corners[seed % len(corners)]), (0.3, 0.0, 0.0)), 4.0)
+        Trial(Conditions(WALKS.scenario(seed, rpy=corners[seed % len(corners)]), (0.3, 0.0, 0.0)), 4.0)
         for seed in range(size.seeds)
     ]
 
@@ -153,7 +133,9 @@ def _tilted(size: Size) -> list[Trial]:
 def _thrown(size: Size) -> list[Trial]:
     rng = np.random.default_rng(ADULT_SEED)
     angles = rng.uniform(0.0, pi / 6, (size.seeds, 3)).tolist()
-    return [Trial(Conditions(_noisy(seed, rpy=tuple(rpy)), (0.3, 0.0, 0.0)), 4.0) for seed, rpy in enumerate(angles)]
+    return [
+        Trial(Conditions(WALKS.scenario(seed, rpy=tuple(rpy)), (0.3, 0.0, 0.0)), 4.0) for seed, rpy in enumerate(angles)
+    ]
 
 
 def _push(contest: Contest, who: Contender, size: Size, direction: float) -> Cells:
@@ -161,19 +143,9 @@ def _push(contest: Contest, who: Contender, size: Size, direction: float) -> Cel
     low, high = 0, round(100.0 / size.push_step)
     while high - low > 1:
         middle = (low + high) // 2
-        outcomes = contest.play(who, _pushes(size, direction, middle * size.push_step))
+        outcomes = contest.play(who, WALKS.pushed(direction, middle * size.push_step, size.phases))
         low, high = (low, middle) if any(outcome.fell for outcome in outcomes) else (middle, high)
     return {"N·s": low * size.push_step}
-
-
-def _pushes(size: Size, direction: float, impulse: float) -> list[Trial]:
-    trials = []
-    for phase in range(size.phases):
-        for sign in (1.0, -1.0):
-            force = sign * impulse / 0.1
-            push = Push(2.0 + CYCLE * phase / size.phases, 0.1, (force * cos(direction), force * sin(direction), 0.0))
-            trials.append(Trial(Conditions(_noisy(phase, pushes=(push,)), (0.4, 0.0, 0.0)), 4.5))
-    return trials
 
 
 def _draws(contest: Contest, who: Contender, size: Size) -> Cells:

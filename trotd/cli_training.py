@@ -80,8 +80,8 @@ def train(
                 from training.plan import make_plan
 
                 plan = make_plan(
-                    name, config.robot.name, config_hash(config), seed, variant, start or "", paper, rough, teacher,
-                    without or (),
+                    name, config.robot.name, config_hash(config), seed=seed, variant=variant, start=start or "",
+                    paper=paper, rough=rough, reference=teacher, without=without or (),
                 )  # fmt: skip
                 plan = plan.shortened(iterations, directions, ticks)
             first = _first(config, beside, plan)
