@@ -7,8 +7,10 @@ from collections.abc import Iterator
 import pytest
 from walks import Walk
 
+from runtime import config as configuration
 from runtime import policies
 from runtime.messages.mode import Mode, Request
+from runtime.reasons import Reason
 from sim.scenario import Scenario
 from sim.terrain import HeightField
 from sim.twin import REAL_NOISE
@@ -32,3 +34,16 @@ def test_it_walks_on_and_no_guard_damps_it(walk: Walk, amplitude: float, seed: i
     walk.run(10.0, (0.5, 0.0, 0.0))
     assert walk.cycle.state.mode is Mode.WALK, walk.cycle.state
     assert walk.world.truth.position[0] > 3.5
+
+
+def test_without_the_moment_that_a_walking_joint_is_given_it_would_be_damped(
+    walk: Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So the walks above do cross what they are said to cross."""
+    strict = configuration.override(walk.config, "test", {"limits.overspeed_time": 0.002})
+    monkeypatch.setattr(walk, "config", strict)
+    walk.set_down(Scenario(seed=0, noise=REAL_NOISE, terrain=HeightField(0.08, 0.10, seed=0, extent=24.0)))
+    walk.stand()
+    walk.ask(Request.WALK)
+    walk.run(4.0, (0.5, 0.0, 0.0))
+    assert (walk.cycle.state.mode, walk.cycle.state.reason) == (Mode.DAMP, Reason.JOINT_SPEED)
