@@ -100,7 +100,7 @@ SETTLE = msgspec.structs.replace(
 )  # fmt: skip
 """From numbers that walk: what stands asks for nothing, and motors may be weak. Small steps keep what was polished."""
 HARDEN = msgspec.structs.replace(
-    SETTLE, name="harden", iterations=40, conditions="hard", learning_rate=0.008, learning_rate_end=0.0008,
+    SETTLE, name="harden", iterations=40, ticks=800, conditions="hard", learning_rate=0.008, learning_rate_end=0.0008,
 )  # fmt: skip
 """What little friction, a hard torque clip and hard pushes still take down."""
 ROUGHEN = msgspec.structs.replace(

@@ -59,6 +59,8 @@ class Randomization:
     motor_strength: Range = (1.0, 1.0)
     weak_share: float = 1.0
     """Share of the episodes whose motors' strength is drawn; the others' is whole."""
+    weak_push: float = 1.0
+    """A push of those with weak motors is this share of what was drawn."""
     extra_delay: Range = (0.0, 0.0)
     """s."""
     velocity_x: Range | None = None
@@ -97,8 +99,9 @@ WEAK = replace(
     motor_strength=(0.42, 0.6),
 )
 """The task, standing, and motors at half their strength: what a hard torque clip leaves."""
-HARD = replace(WEAK, friction=(0.3, 1.2), push_impulse=(20.0, 65.0), weak_share=0.3)
-"""More of that, pushes that few withstand, and ground as smooth as the table's smoothest."""
+HARD = replace(WEAK, friction=(0.3, 1.2), push_impulse=(20.0, 65.0), weak_share=0.4, weak_push=0.2)
+"""More of that, pushes that few withstand, and ground as smooth as the table's smoothest.
+Weak motors hold no such push, whatever the policy: without most of it they teach how to walk by half the torque."""
 ROUGH = Randomization(
     tilt=0.2, friction=(0.6, 1.2), noise=True, push_probability=0.4, push_impulse=(10.0, 35.0), push_time=(0.6, 2.5),
     bump=0.1, bump_spacing=(0.1, 0.2), slope=0.2, level_share=0.15,
@@ -134,15 +137,20 @@ def draw(bounds: Randomization, rng: np.random.Generator) -> Conditions:
     command = _draw_command(bounds, rng)
     if bounds.weak_share < 1.0 and rng.random() >= bounds.weak_share:
         scenario = replace(scenario, motor_strength=1.0)
+    elif bounds.weak_push < 1.0:
+        scenario = _softened(scenario, bounds.weak_push)
     if bounds.standing_share > 0.0 and rng.random() < bounds.standing_share:
-        return Conditions(
-            replace(scenario, pushes=tuple(map(_softened, scenario.pushes))), (0.0, 0.0, 0.0), standing=True
-        )
+        return Conditions(_softened(scenario, STANDING_PUSH), (0.0, 0.0, 0.0), standing=True)
     return Conditions(scenario, command)
 
 
-def _softened(push: Push) -> Push:
-    x, y, z = (STANDING_PUSH * axis for axis in push.force)
+def _softened(scenario: Scenario, share: float) -> Scenario:
+    """The same with pushes of ``share`` of their force."""
+    return replace(scenario, pushes=tuple(_scaled(push, share) for push in scenario.pushes))
+
+
+def _scaled(push: Push, share: float) -> Push:
+    x, y, z = (share * axis for axis in push.force)
     return replace(push, force=(x, y, z))
 
 
