@@ -18,6 +18,7 @@ from training import evaluators
 from training.evaluators import InProcess, Processes
 from training.plan import StagePlan
 from training.randomize import (
+    HARD,
     IMITATION,
     NOMINAL,
     ROUGH,
@@ -103,6 +104,18 @@ def test_some_episodes_stand_and_some_motors_are_weak() -> None:
     assert weak.min() < 0.46 and weak.max() > 0.95
     halved = np.array([draw(WEAK, rng).scenario.motor_strength for _ in range(400)])
     assert 0.74 < (halved == 1.0).mean() < 0.86 and halved[halved < 1.0].max() < 0.6
+
+
+def test_weak_motors_are_pushed_less_where_pushes_are_hard() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [draw(HARD, rng) for _ in range(600)]
+
+    def hardest(weak: bool) -> float:
+        walks = [one.scenario for one in drawn if not one.standing and (one.scenario.motor_strength < 1.0) == weak]
+        return float(max(np.hypot(*push.force[:2]) * push.duration for walk in walks for push in walk.pushes))
+
+    assert 60.0 < hardest(weak=False) <= 65.0
+    assert hardest(weak=True) == pytest.approx(0.2 * 65.0, rel=0.05)
 
 
 def test_nominal_conditions_are_the_worlds_own() -> None:
