@@ -22,6 +22,8 @@ FORWARD, SIDEWAYS = 60.0, 50.0
 PHASES = 8
 CLIPPED_WALKS = 48
 """With torques clipped, where policies of one run differ most: of 16 one tells a fall in twenty by chance."""
+SMOOTH_WALKS = 32
+"""With friction 0.3."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,7 @@ def _measured() -> list[Trial]:
 
 def _taken_down() -> list[Trial]:
     pushes = WALKS.pushed(0.0, FORWARD, PHASES) + WALKS.pushed(pi / 2, SIDEWAYS, PHASES)
-    return pushes + WALKS.hard(CLIPPED_WALKS, motor_strength=CLIPPED)
+    return pushes + WALKS.hard(CLIPPED_WALKS, motor_strength=CLIPPED) + WALKS.hard(SMOOTH_WALKS, friction=0.3)
 
 
 def _steep_fields() -> list[Trial]:
