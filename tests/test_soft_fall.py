@@ -30,15 +30,19 @@ def knocked(force: float, believed: bool = True) -> tuple[Rig, float]:
     return rig, down
 
 
-@pytest.mark.parametrize("force", [500.0, 550.0])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_a_robot_that_is_knocked_over_is_low_before_it_lands(side: float, force: float) -> None:
-    """One that damps when it has tilted falls down faster."""
-    soft, slow = knocked(side * force)
-    hard, fast = knocked(side * force, believed=False)
-    assert next(fault.evidence.reason for fault in soft.cycle.faults) == "falling"
-    assert "falling" not in [fault.evidence.reason for fault in hard.cycle.faults]
-    assert slow < 0.8 * fast
+def test_a_robot_that_is_knocked_over_is_low_before_it_lands(side: float) -> None:
+    """One that damps when it has tilted falls down faster, and lands with a third more energy or above."""
+    slow, fast = [], []
+    for force in (500.0, 550.0, 600.0):
+        soft, down = knocked(side * force)
+        slow.append(down)
+        hard, down = knocked(side * force, believed=False)
+        fast.append(down)
+        assert next(fault.evidence.reason for fault in soft.cycle.faults) == "falling"
+        assert "falling" not in [fault.evidence.reason for fault in hard.cycle.faults]
+    assert (np.array(slow) < 0.9 * np.array(fast)).all(), (slow, fast)
+    assert np.square(slow).sum() < 0.75 * np.square(fast).sum(), (slow, fast)
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
